@@ -23,13 +23,13 @@ class ZsimError(Exception):
         frames = list(takewhile(lambda each: _package(each) not in PACKAGES, _entries(self.__traceback__)))
         while frames and _package(frames[-1]) in sys.stdlib_module_names:  # through which zsim calls itself
             frames.pop()
-        way: TracebackType | None = None
+        traceback: TracebackType | None = None
         for each in reversed(frames):
-            way = TracebackType(way, each.tb_frame, each.tb_lasti, each.tb_lineno)
+            traceback = TracebackType(traceback, each.tb_frame, each.tb_lasti, each.tb_lineno)
         chained = self.__cause__, self.__suppress_context__
         self.__cause__ = None
         try:
-            return get_ipython().InteractiveTB.structured_traceback(type(self), self, way)
+            return get_ipython().InteractiveTB.structured_traceback(type(self), self, traceback)
         finally:
             self.__cause__, self.__suppress_context__ = chained
 
@@ -151,10 +151,10 @@ CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u20
 
 def printable(text: str) -> str:
     """Return a text for a terminal, with control codes escaped, which network data may contain."""
-    return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
+    return CONTROL.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
-_FIGURE = re.compile(r"(?<![\w.:-])-?\d+(\.\d+)?(e[-+]?\d+)?(?![\w:]|\.\d)")  # a number that is not part of a name
+_NUMBER = re.compile(r"(?<![\w.:-])-?\d+(\.\d+)?(e[-+]?\d+)?(?![\w:]|\.\d)")  # a number that is not part of a name
 REASON_MAX = 300  # maximum number of characters of a reason
 
 
@@ -164,9 +164,9 @@ def reason_of(error: BaseException) -> str:
     return text if isinstance(error, ZsimError) and text else f"{type(error).__name__}: {text}"
 
 
-def without_figures(text: str) -> str:
+def without_numbers(text: str) -> str:
     """Return a reason with its numbers replaced by #, except in names, to compare reasons regardless of numbers."""
-    return _FIGURE.sub("#", text)
+    return _NUMBER.sub("#", text)
 
 
 # The smallest extra of pyproject.toml that installs a module, by the module's import name.
@@ -206,7 +206,7 @@ def install_command(extras: Iterable[str]) -> str:
     if not (checkout / "pyproject.toml").exists():
         return f"pip install '.[{names}]' in a checkout of zsim"
     inside = {path: os.path.relpath(path) for path in (sys.executable, str(checkout))}
-    python, folder = (path if near.startswith("..") else near for path, near in inside.items())
+    python, folder = (path if relative.startswith("..") else relative for path, relative in inside.items())
     return f"{python} -m pip install -e '{folder}[{names}]'"
 
 

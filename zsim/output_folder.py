@@ -59,7 +59,7 @@ def no_locks(folder: Path) -> str | None:
 
 
 @contextmanager
-def held_folder(folder: Path, mark: str, own: Collection[str], force: bool, use: str, others: str) -> Iterator[None]:
+def locked_folder(folder: Path, mark: str, own: Collection[str], force: bool, use: str, others: str) -> Iterator[None]:
     """Create a folder and lock it against other processes for the duration of the block.
 
     Args:
@@ -74,11 +74,11 @@ def held_folder(folder: Path, mark: str, own: Collection[str], force: bool, use:
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / mark).exists():
             refuse_others(folder, own, force, use)
-        held = (folder / ".lock").open("w")
+        lock_file = (folder / ".lock").open("w")
     except OSError as error:
         raise RunError(f"{folder}: cannot be made ({error.strerror}); give --out another folder") from error
-    with held:
-        if not take_lock(held):
+    with lock_file:
+        if not take_lock(lock_file):
             raise RunError(f"{folder}: {others} there; give --out another folder")
         yield
 
@@ -97,8 +97,8 @@ def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> 
     """
     others = sorted(each.name for each in folder.iterdir() if each.name not in own)
     if others and not force:
-        named = ", ".join(others[:OTHERS_NAMED]) + (", …" if len(others) > OTHERS_NAMED else "")
-        raise RunError(f"{folder}: holds {named}; give --out an empty folder, or --force to {use} this one")
+        names = ", ".join(others[:OTHERS_NAMED]) + (", …" if len(others) > OTHERS_NAMED else "")
+        raise RunError(f"{folder}: holds {names}; give --out an empty folder, or --force to {use} this one")
 
 
 TEMPORARY = "zsim-temporary-"  # prefix of folders that a process keeps locked until it ends
@@ -118,21 +118,21 @@ def _own_temporary(_pid: int) -> Path:
     """Return the parent folder of a process's temporary folders; the argument gives a forked child its own."""
     from multiprocessing.util import Finalize  # unlike atexit, also runs in children started by multiprocessing
 
-    _remove_left()
-    made = Path(mkdtemp(prefix="zsim-unlocked-"))
+    _remove_abandoned()
+    unlocked = Path(mkdtemp(prefix="zsim-unlocked-"))
     if fcntl is not None:
-        take_lock(os.open(made, os.O_RDONLY))  # left open, so that the lock lasts
-    folder = made.rename(made.with_name(made.name.replace("zsim-unlocked-", TEMPORARY)))
+        take_lock(os.open(unlocked, os.O_RDONLY))  # left open, so that the lock lasts
+    folder = unlocked.rename(unlocked.with_name(unlocked.name.replace("zsim-unlocked-", TEMPORARY)))
     Finalize(None, shutil.rmtree, (folder, True), exitpriority=-100)  # after multiprocessing has joined the children
     return folder
 
 
-def _remove_left() -> None:
+def _remove_abandoned() -> None:
     """Remove the temporary folders of killed processes, which are those that are not locked."""
-    place = Path(gettempdir())
-    if fcntl is None or no_locks(place):
+    root = Path(gettempdir())
+    if fcntl is None or no_locks(root):
         return
-    for folder in place.glob(f"{TEMPORARY}*"):
+    for folder in root.glob(f"{TEMPORARY}*"):
         with suppress(OSError):
             if folder.lstat().st_uid == os.getuid():
                 opened = os.open(folder, os.O_RDONLY)
@@ -158,6 +158,6 @@ def record_in(folder: Path) -> Path:
     return record
 
 
-def record_at(place: Path) -> Path:
+def record_at(path: Path) -> Path:
     """Return the path of a record, given that path or a run's folder (see `record_in`)."""
-    return place if place.is_file() else record_in(place)
+    return path if path.is_file() else record_in(path)

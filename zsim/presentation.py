@@ -20,9 +20,9 @@ from rich.text import Text
 from zsim.errors import printable
 from zsim.runtime.progress import PipedConsole
 
-NAME_WHOLE = 22  # characters; columns are omitted so that a name keeps this width
-WORD_WHOLE = 40  # characters; columns are omitted so that words of text up to this width are not broken
-TEXT_LEAST = 18  # characters; columns are omitted so that text keeps this width
+NAME_WIDTH = 22  # characters; columns are omitted so that a name keeps this width
+WORD_WIDTH_MAX = 40  # characters; columns are omitted so that words of text up to this width are not broken
+TEXT_WIDTH_MIN = 18  # characters; columns are omitted so that text keeps this width
 UNLIMITED = 10_000  # characters; wider than any table
 NAME_MIN = 12  # characters that a name keeps in a table that is too wide: `…tor.drone12`
 
@@ -84,34 +84,34 @@ class FittedTable:
         wide = console.options.update(width=UNLIMITED)
         while True:
             narrowest = self._empty()
-            for place in shown:
-                narrowest.add_column(width=self._least(place))
-            spare = [place for place in shown if self.columns[place].worth is not None]
+            for index in shown:
+                narrowest.add_column(width=self._min_width(index))
+            spare = [index for index in shown if self.columns[index].worth is not None]
             if not spare or Measurement.get(console, wide, narrowest).minimum <= width:
                 return shown
-            shown.remove(min(spare, key=lambda place: (self.columns[place].worth, -place)))
+            shown.remove(min(spare, key=lambda index: (self.columns[index].worth, -index)))
 
     def _table(self, shown: Sequence[int]) -> Table:
         table = self._empty()
-        for place in shown:
-            column = self.columns[place]
+        for index in shown:
+            column = self.columns[index]
             is_figure = column.kind == "figure"
             table.add_column(
                 Text(printable(column.header), no_wrap=True),
                 justify="right" if column.right else "left",
                 no_wrap=is_figure,
-                min_width=self._least(place) if is_figure else None,
+                min_width=self._min_width(index) if is_figure else None,
             )
         for row in self._rows:
             cells: list[RenderableType] = []
-            for place in shown:
-                kind = self.columns[place].kind
+            for index in shown:
+                kind = self.columns[index].kind
                 is_cut = self._one_line or kind == "figure"
                 if kind == "name":
-                    cells.append(NameCell(printable(row[place])))
+                    cells.append(NameCell(printable(row[index])))
                 else:
                     overflow = "ellipsis" if is_cut else "fold"
-                    cells.append(Text(printable(row[place]), no_wrap=is_cut, overflow=overflow))
+                    cells.append(Text(printable(row[index]), no_wrap=is_cut, overflow=overflow))
             table.add_row(*cells)
         return table
 
@@ -119,15 +119,17 @@ class FittedTable:
         has_head = any(column.header for column in self.columns)
         return Table(box=self._lines, pad_edge=self._lines is not None, show_header=has_head)
 
-    def _least(self, place: int) -> int:
+    def _min_width(self, index: int) -> int:
         """Return the width of a column [characters] below which other columns are omitted."""
-        column = self.columns[place]
+        column = self.columns[index]
         header = max(map(len, column.header.split("\n")))
-        cells = [printable(row[place]) for row in self._rows]
+        cells = [printable(row[index]) for row in self._rows]
         longest = max(map(len, cells), default=0)
         word = 0 if self._one_line else max((len(word) for cell in cells for word in cell.split()), default=0)
-        most = {"name": NAME_WHOLE, "text": max(TEXT_LEAST, min(word, WORD_WHOLE)), "figure": longest}[column.kind]
-        return max(header, min(longest, most))
+        limit = {"name": NAME_WIDTH, "text": max(TEXT_WIDTH_MIN, min(word, WORD_WIDTH_MAX)), "figure": longest}[
+            column.kind
+        ]
+        return max(header, min(longest, limit))
 
 
 def print_table(table: FittedTable) -> None:
@@ -170,9 +172,9 @@ def drone_colours(count: int) -> tuple[str, ...]:
         return FEW[:count]
     colours = []
     for i in range(count):
-        place = i / (count - 1) * (len(MANY) - 1)
-        before = min(int(place), len(MANY) - 2)
-        mixed = (a + (place - before) * (b - a) for a, b in zip(rgb(MANY[before]), rgb(MANY[before + 1]), strict=True))
+        position = i / (count - 1) * (len(MANY) - 1)
+        lower = min(int(position), len(MANY) - 2)
+        mixed = (a + (position - lower) * (b - a) for a, b in zip(rgb(MANY[lower]), rgb(MANY[lower + 1]), strict=True))
         colours.append("#" + "".join(f"{round(part):02x}" for part in mixed))
     return tuple(colours)
 

@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 from wire import PATIENCE_S
 
 from zsim.record import RecordReader, RecordWriter
-from zsim.record.mcap_layout import places
+from zsim.record.mcap_layout import record_spans
 
 PILOT = "operator.pilot"
 PLAIN = ROOT / "examples" / "plain_client.py"
@@ -238,7 +238,7 @@ def damaged(record: Path, into: Path, part: float, cut: int = 0) -> Path:
             if count % 300 == 0:
                 writer.flush()
     data = bytearray(path.read_bytes())
-    chunks = [place for place in places(bytes(data)) if place.opcode == Opcode.CHUNK]
+    chunks = [place for place in record_spans(bytes(data)) if place.opcode == Opcode.CHUNK]
     data[chunks[round(part * (len(chunks) - 1))].end - 9] ^= 4
     path.write_bytes(data[: len(data) - cut])
     return into

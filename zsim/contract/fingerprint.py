@@ -24,7 +24,7 @@ from zsim import CONTRACT, __version__
 PACKAGES = ("numpy", "scipy", "numba", "llvmlite")  # numeric packages
 CODE = ("zsim", "zsim_world", "zsim_agents")  # packages whose sources determine a flight
 COLUMNS = 13  # position, velocity, orientation, angular velocity of a drone
-HELD_BYTES = 16_384  # bytes hashed at once, which takes no longer than a few small updates
+BUFFER_BYTES = 16_384  # bytes hashed at once, which takes no longer than a few small updates
 
 
 @cache
@@ -57,16 +57,16 @@ def machine() -> dict[str, str]:
 
 def _code() -> str:
     """Return a hash of the sources of the packages in CODE, independent of line endings and folder."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for package in CODE:
         spec = importlib.util.find_spec(package)
         if spec is None or spec.origin is None:
             continue
         folder = Path(spec.origin).parent
         for name in sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.py")):
-            found.update(f"{package}/{name}\0".encode())
-            found.update((folder / name).read_bytes().replace(b"\r\n", b"\n"))
-    return found.hexdigest()[:16]
+            digest.update(f"{package}/{name}\0".encode())
+            digest.update((folder / name).read_bytes().replace(b"\r\n", b"\n"))
+    return digest.hexdigest()[:16]
 
 
 def _version(package: str) -> str:
@@ -78,17 +78,17 @@ def _version(package: str) -> str:
 
 def _cpu() -> str:
     """Return the processor's model and a hash of its feature flags, on which libraries and compilers depend."""
-    found: dict[str, str] = {}
+    entries: dict[str, str] = {}
     try:
         with open("/proc/cpuinfo", encoding="ascii", errors="replace") as lines:
             for line in lines:
                 name, _, value = line.partition(":")
-                found.setdefault(name.strip(), value.strip())
+                entries.setdefault(name.strip(), value.strip())
     except OSError:
         return platform.processor()
-    flags = found.get("flags", found.get("Features", ""))
+    flags = entries.get("flags", entries.get("Features", ""))
     digest = hashlib.sha256(" ".join(sorted(flags.split())).encode()).hexdigest()[:8]
-    return " ".join(filter(None, (found.get("model name", ""), digest)))
+    return " ".join(filter(None, (entries.get("model name", ""), digest)))
 
 
 def _blas() -> str:
@@ -96,7 +96,7 @@ def _blas() -> str:
 
     OpenCV has its own BLAS, which is not used here and may select another processor.
     """
-    found = set()
+    libraries = set()
     for each in threadpoolctl.threadpool_info():
         folder = Path(each["filepath"]).parent
         package = None  # package whose wheel contains the library; None: the system's
@@ -105,8 +105,8 @@ def _blas() -> str:
         elif folder.name == ".dylibs":  # as delocate does
             package = folder.parent.name
         if each["user_api"] == "blas" and package in (None, *PACKAGES):
-            found.add(f"{each['internal_api']}-{each.get('architecture', '')}")
-    return " ".join(sorted(found)) or "none"
+            libraries.add(f"{each['internal_api']}-{each.get('architecture', '')}")
+    return " ".join(sorted(libraries)) or "none"
 
 
 class TruthHash:
@@ -123,13 +123,13 @@ class TruthHash:
         self._copy: Callable[[memoryview], object] | None = None
         row = np.dtype([("t", "<i8"), ("x", "<f8", COLUMNS)])
         self._hash = hashlib.sha256()
-        self._rows = np.zeros((max(1, HELD_BYTES // max(1, rows * row.itemsize)), rows), dtype=row)
+        self._rows = np.zeros((max(1, BUFFER_BYTES // max(1, rows * row.itemsize)), rows), dtype=row)
         self._t, self._x = self._rows["t"], self._rows["x"]
-        self._held = 0
+        self._buffered = 0
 
     def resume(self, hashed: Iterable[bytes], copy: Callable[[memoryview], object]) -> None:
         """Restart from the bytes passed to a former `copy`, and pass further bytes to `copy`."""
-        self._hash, self._held = hashlib.sha256(), 0
+        self._hash, self._buffered = hashlib.sha256(), 0
         for data in hashed:
             self._hash.update(data)
         self._copy = copy
@@ -140,7 +140,7 @@ class TruthHash:
         return self._hash.copy()
 
     def restore(self, snapshot: Any) -> None:
-        self._hash, self._held = snapshot.copy(), 0
+        self._hash, self._buffered = snapshot.copy(), 0
 
     def add(self, t_ns: ArrayLike, state: NDArray[np.float64]) -> None:
         """Add rows.
@@ -149,20 +149,20 @@ class TruthHash:
             t_ns: time of all rows, or of each row, (rows,) [ns].
             state: (rows, 13 or more), beginning with position, velocity, orientation, angular velocity.
         """
-        self._t[self._held] = t_ns
-        self._x[self._held] = state[:, :COLUMNS]
-        self._held += 1
-        if self._held == len(self._rows):
+        self._t[self._buffered] = t_ns
+        self._x[self._buffered] = state[:, :COLUMNS]
+        self._buffered += 1
+        if self._buffered == len(self._rows):
             self.flush()
 
     def flush(self) -> None:
-        if not self._held or not self._rows.size:  # no rows if all drones are external
-            self._held = 0
+        if not self._buffered or not self._rows.size:  # no rows if all drones are external
+            self._buffered = 0
             return
-        self._hash.update(data := self._rows[: self._held].data)
+        self._hash.update(data := self._rows[: self._buffered].data)
         if self._copy:
             self._copy(data.cast("B"))
-        self._held = 0
+        self._buffered = 0
 
     def hexdigest(self) -> str:
         self.flush()

@@ -377,14 +377,14 @@ _RULES: dict[str, tuple[str, frozenset[DroneState]]] = {
 _SETPOINT = ("a setpoint needs it hovering or flying", AIRBORNE)
 
 
-def state_refusal(name: str, state: str, asked: str) -> str | None:
+def state_refusal(name: str, state: str, requested: str) -> str | None:
     """Return why a drone refuses a command in its current state; None if it accepts the command.
 
     Args:
         name: name of the drone.
-        asked: the requested mode; any other text stands for a setpoint.
+        requested: the requested mode; any other text stands for a setpoint.
     """
-    need, states = _RULES.get(asked, _SETPOINT)
+    need, states = _RULES.get(requested, _SETPOINT)
     return None if state in states else f"{name} is {state}; {need}"
 
 
@@ -412,10 +412,10 @@ def truth_fault(truth: Truth, rotors: int) -> str | None:
         ("velocity_m_s", SPEED_MAX_M_S, "m/s"),
         ("angular_velocity_rad_s", RATE_MAX_RAD_S, "rad/s"),
     )
-    for name, most, unit in limits:
+    for name, limit, unit in limits:
         values: Sequence[float] = getattr(truth, name)
-        if max(map(abs, values)) > most:
-            return f"{name} is {_shown(values)}; each must be within {most:g} {unit}"
+        if max(map(abs, values)) > limit:
+            return f"{name} is {_shown(values)}; each must be within {limit:g} {unit}"
     if abs(el.length(truth.orientation_wxyz) - 1.0) > UNIT_SLACK:
         return f"orientation_wxyz is {_shown(truth.orientation_wxyz)}; must be a quaternion of length 1"
     if len(truth.rotor_rad_s) != rotors:

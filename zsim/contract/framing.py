@@ -46,7 +46,7 @@ UINT8, INT8 = 0xCC, 0xD0  # followed by the type bytes for 16, 32 and 64 bits
 COUNT_MAX = 0x7F  # largest integer that is its own type byte
 INFINITE = np.uint64(0x7FF0_0000_0000_0000)  # exponent bits of infinities and NaN
 _encode = msgspec.msgpack.Encoder().encode
-_WHOLE = {
+_SCALAR_OPS = {
     kinds_of.IntType: INT,
     kinds_of.BoolType: BOOL,
     kinds_of.LiteralType: TEXT,
@@ -69,8 +69,8 @@ def run_key_table(info: messages.Info) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=8)
-def _places(table: tuple[str, ...]) -> dict[str, int]:
-    return {key: place for place, key in enumerate(table)}
+def _key_indices(table: tuple[str, ...]) -> dict[str, int]:
+    return {key: index for index, key in enumerate(table)}
 
 
 class _PackedGate(Struct, array_like=True, gc=False):
@@ -117,8 +117,8 @@ class GateMessages:
         first: Sequence[int] = (),
     ) -> "GateMessages":
         """Return encoded messages as one object."""
-        places = _places(table)
-        which = np.array([places[key] for key, _ in pairs], dtype=np.int64)
+        indices = _key_indices(table)
+        which = np.array([indices[key] for key, _ in pairs], dtype=np.int64)
         ends = np.cumsum([GAP + len(payload) for _, payload in pairs])
         buffer = b"".join([bytes(GAP) + payload for _, payload in pairs])
         times = np.array([t_ns] * len(pairs) if stamps is None else stamps, dtype=np.int64)
@@ -160,9 +160,9 @@ class GateMessages:
     @cached_property
     def pairs(self) -> Pairs:
         data, table = bytes(self.buffer), self.table
-        places: list[int] = self.which.tolist()
+        indices: list[int] = self.which.tolist()
         bounds = pairwise([0, *self.ends.tolist()])
-        return [(table[p], data[start + GAP : end]) for p, (start, end) in zip(places, bounds, strict=True)]
+        return [(table[p], data[start + GAP : end]) for p, (start, end) in zip(indices, bounds, strict=True)]
 
     def decoded(self) -> Iterator[tuple[str, Any]]:
         """Yield keys and messages; raise DecodeError if a message does not fit its key."""
@@ -180,19 +180,19 @@ class PerPattern(Generic[T]):
     def __init__(self, learn: Callable[[GateMessages], T]) -> None:
         self._learn = learn
         self._table: Sequence[str] = ()
-        self._known: dict[bytes, T] = {}
+        self._learned: dict[bytes, T] = {}
 
     def of(self, gate: GateMessages) -> T:
         if gate.table is not self._table:
             self._table = gate.table
-            self._known.clear()
+            self._learned.clear()
         pattern = gate.which.tobytes()
-        known = self._known.get(pattern)
-        if known is None:
-            known = self._learn(gate)
-            if len(self._known) < PATTERNS_MAX:
-                self._known[pattern] = known
-        return known
+        learned = self._learned.get(pattern)
+        if learned is None:
+            learned = self._learn(gate)
+            if len(self._learned) < PATTERNS_MAX:
+                self._learned[pattern] = learned
+        return learned
 
 
 def _refuse(reason: str) -> NoReturn:
@@ -259,9 +259,9 @@ class Layouts:
         ops, literals = np.array(self._ops, dtype=np.int64), np.frombuffer(bytes(self._literals), dtype=np.uint8)
         self.program = Program(ops, np.array(first), literals)
 
-    def room(self, words: TextTable) -> int:
+    def room(self, texts: TextTable) -> int:
         """Return the maximum size of a message, including GAP [bytes]."""
-        longest = int(np.diff(words.ends, prepend=0).max(initial=0))
+        longest = int(np.diff(texts.ends, prepend=0).max(initial=0))
         fixed = sum(size for op, _, size in self._ops if op == LITERAL)
         return GAP + fixed + self.floats * FLOAT_BYTES + self.ints * max(INT_BYTES_MAX, longest)
 
@@ -273,8 +273,8 @@ class Layouts:
         for field in fields.fields:
             self._literal(_encode(field.encode_name))
             own = field.type
-            if type(own) in _WHOLE:
-                self._ops.append((_WHOLE[type(own)], self._int, 0))
+            if type(own) in _SCALAR_OPS:
+                self._ops.append((_SCALAR_OPS[type(own)], self._int, 0))
                 self._int += 1
                 continue
             count = 1
@@ -288,9 +288,9 @@ class Layouts:
         self.ints, self.floats = max(self.ints, self._int), max(self.floats, self._float)
 
     def _literal(self, data: bytes) -> None:
-        op, place, size = self._ops[-1]
+        op, offset, size = self._ops[-1]
         if op == LITERAL:
-            self._ops[-1] = (LITERAL, place, size + len(data))
+            self._ops[-1] = (LITERAL, offset, size + len(data))
         else:
             self._ops.append((LITERAL, len(self._literals), len(data)))
         self._literals += data
@@ -300,13 +300,13 @@ def array_head(size: int) -> bytes:
     return _encode([0] * size)[:-size]
 
 
-def words(texts: Iterable[str | None]) -> TextTable:
+def text_table(texts: Iterable[str | None]) -> TextTable:
     """Return the table of some texts for `write`."""
     parts = [_encode(text) for text in texts]
     return TextTable(np.frombuffer(b"".join(parts), dtype=np.uint8), np.cumsum([len(part) for part in parts]))
 
 
-def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: NDArray, out: NDArray, start: int) -> int:
+def write(program: Program, texts: TextTable, kind: int, ints: NDArray, bits: NDArray, out: NDArray, start: int) -> int:
     """Write one message into `out` at `start`; return its end. To be compiled by the caller.
 
     Args:
@@ -316,31 +316,31 @@ def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: ND
     """
     at = np.uint64(start)  # unsigned indices need no test for negative values: byte loops become word copies
     for k in range(program.first[kind], program.first[kind + 1]):
-        op, place, size = program.ops[k, 0], program.ops[k, 1], program.ops[k, 2]
+        op, offset, size = program.ops[k, 0], program.ops[k, 1], program.ops[k, 2]
         if op == LITERAL:
             for i in range(np.uint64(size)):
-                out[at + i] = program.literals[np.uint64(place) + i]
+                out[at + i] = program.literals[np.uint64(offset) + i]
             at += np.uint64(size)
         elif op == FLOATS:
-            for column in range(place, place + size):
+            for column in range(offset, offset + size):
                 word = bits[column]
                 out[at] = FLOAT64
                 for i in range(8):
                     out[at + np.uint64(1 + i)] = (word >> np.uint64(56 - 8 * i)) & np.uint64(0xFF)
                 at += np.uint64(FLOAT_BYTES)
         elif op == BOOL:
-            out[at] = TRUE if ints[place] else FALSE
+            out[at] = TRUE if ints[offset] else FALSE
             at += np.uint64(1)
         elif op == TEXT:
-            word = ints[place]
-            for i in range(words.ends[word - 1] if word else 0, words.ends[word]):
-                out[at] = words.data[i]
+            word = ints[offset]
+            for i in range(texts.ends[word - 1] if word else 0, texts.ends[word]):
+                out[at] = texts.data[i]
                 at += np.uint64(1)
         else:
-            value, size = ints[place], 1
+            value, size = ints[offset], 1
             if value < -32 or value > 127:
-                reach, free = (value, 8) if value > 0 else (-1 - value, 7)  # int8 from -128, uint8 up to 255
-                power = 0 if reach < 1 << free else 1 if reach < 1 << free + 8 else 2 if reach < 1 << free + 24 else 3
+                mag, free = (value, 8) if value > 0 else (-1 - value, 7)  # int8 from -128, uint8 up to 255
+                power = 0 if mag < 1 << free else 1 if mag < 1 << free + 8 else 2 if mag < 1 << free + 24 else 3
                 size = 1 << power
                 out[at] = (UINT8 if value > 0 else INT8) + power
                 at += np.uint64(1)
@@ -362,17 +362,17 @@ def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints:
     """
     at, stop = np.uint64(start), np.uint64(end)
     for k in range(program.first[kind], program.first[kind + 1]):
-        op, place, size = program.ops[k, 0], program.ops[k, 1], program.ops[k, 2]
+        op, offset, size = program.ops[k, 0], program.ops[k, 1], program.ops[k, 2]
         if at + np.uint64(size if op == LITERAL else size * FLOAT_BYTES if op == FLOATS else 1) > stop:
             return False
         mark = np.int64(data[at])
         if op == LITERAL:
             for i in range(np.uint64(size)):
-                if data[at + i] != program.literals[np.uint64(place) + i]:
+                if data[at + i] != program.literals[np.uint64(offset) + i]:
                     return False
             at += np.uint64(size)
         elif op == FLOATS:
-            for column in range(place, place + size):
+            for column in range(offset, offset + size):
                 word = np.uint64(0)
                 for i in range(8):
                     word |= np.uint64(data[at + np.uint64(1 + i)]) << np.uint64(56 - 8 * i)
@@ -381,7 +381,7 @@ def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints:
                 bits[column] = word
                 at += np.uint64(FLOAT_BYTES)
         elif op == BOOL and mark in (FALSE, TRUE):
-            ints[place] = mark == TRUE
+            ints[offset] = mark == TRUE
             at += np.uint64(1)
         elif op == INT and (mark <= COUNT_MAX or UINT8 <= mark < INT8):
             size = 0 if mark <= COUNT_MAX else 1 << (mark - UINT8)
@@ -392,7 +392,7 @@ def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints:
                 value = (value << 8) | np.int64(data[at + np.uint64(1 + i)])
             if value < 0:
                 return False
-            ints[place] = value
+            ints[offset] = value
             at += np.uint64(1 + size)
         else:
             return False

@@ -166,9 +166,9 @@ def estimates_view(process_name: str) -> str:
     return f"view/estimates/{process_name}"
 
 
-def process(process_name: str, what: str) -> str:
-    """Return a key of a process; `what` is `join`, `done`, `snapshot`, `bye` or `health`."""
-    return f"process/{process_name}/{what}"
+def process(process_name: str, topic: str) -> str:
+    """Return a key of a process; `topic` is `join`, `done`, `snapshot`, `bye` or `health`."""
+    return f"process/{process_name}/{topic}"
 
 
 def replay(process_name: str) -> str:
@@ -201,8 +201,8 @@ def session_of(token_key: str) -> str:
 @lru_cache(maxsize=4096)
 def parts(key: str) -> tuple[str, str, str]:
     """Return the parts of a key, e.g. `drone`, its name, and `cmd/mode`; missing parts are empty."""
-    kind, whose, what, *_ = *key.split("/", 2), "", ""
-    return kind, whose, what
+    kind, owner, topic, *_ = *key.split("/", 2), "", ""
+    return kind, owner, topic
 
 
 def thing(key: str) -> str:
@@ -218,8 +218,8 @@ def is_command(key: str) -> bool:
 
 
 def is_accepted(key: str) -> bool:
-    kind, _, what = parts(key)
-    return kind == "drone" and what.startswith("accepted/")
+    kind, _, topic = parts(key)
+    return kind == "drone" and topic.startswith("accepted/")
 
 
 def is_sensor(expression: str) -> bool:
@@ -235,8 +235,8 @@ def is_status(key: str) -> bool:
 @lru_cache(maxsize=4096)
 def is_picture(key: str) -> bool:
     """Return whether a key carries pictures, which are large and not needed for lockstep."""
-    kind, _, what = parts(key)
-    return kind == "drone" and what.startswith("camera/") and what.count("/") == 1
+    kind, _, topic = parts(key)
+    return kind == "drone" and topic.startswith("camera/") and topic.count("/") == 1
 
 
 def may_drop(key: str) -> bool:

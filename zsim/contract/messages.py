@@ -229,7 +229,7 @@ class Info(Message, frozen=True):
     def __post_init__(self) -> None:
         register_sensors(self.own_sensors)
         for each in filter(MessageInfo.is_sound, self.own_messages):
-            if not each.declares(_OWN.get(each.key)):
+            if not each.declares(_USER_TYPES.get(each.key)):
                 _register(each.key, type_of_info(each))
 
     @property
@@ -239,8 +239,12 @@ class Info(Message, frozen=True):
     @property
     def sensors_beside(self) -> tuple[str, ...]:
         """Names of the sensors besides the contract's six that the run's drones have, in the order of their keys."""
-        seen = (keys.SIGHTINGS,) * (self.sightings is True)
-        return (*(each.name for each in self.own_sensors), *seen, *(() if self.scanners is UNSET else self.scanners))
+        sightings = (keys.SIGHTINGS,) * (self.sightings is True)
+        return (
+            *(each.name for each in self.own_sensors),
+            *sightings,
+            *(() if self.scanners is UNSET else self.scanners),
+        )
 
     @property
     def own_messages(self) -> tuple[MessageInfo, ...]:
@@ -259,7 +263,7 @@ RELAYED = (
 )
 """Messages, or their bases, that agents publish for each other; the world counts them like commands."""
 KEYS_KEPT = 65_536  # maximum number of keys with cached types; 1000 drones have 15 000; garbage keys are evicted
-_OWN: dict[str, type[Struct]] = {}  # users' message classes by shape of their key, from the newest Info
+_USER_TYPES: dict[str, type[Struct]] = {}  # users' message classes by shape of their key, from the newest Info
 
 
 def _plain(value: Any) -> Any:
@@ -277,15 +281,15 @@ def shape_of(key: str) -> str:
     """Return a key with `*` in place of its name, as in TOPICS."""
     if key in TOPICS:
         return key
-    kind, whose, what = keys.parts(key)
-    return f"view/{whose}/*" if kind == "view" else f"{kind}/*/{what}"
+    kind, owner, topic = keys.parts(key)
+    return f"view/{owner}/*" if kind == "view" else f"{kind}/*/{topic}"
 
 
 @lru_cache(maxsize=KEYS_KEPT)
 def type_of(key: str) -> type[Struct] | None:
     """Return the message type of a key; None for an unknown key."""
     shape = shape_of(key)
-    return TOPICS[shape].message if shape in TOPICS else _OWN.get(shape)
+    return TOPICS[shape].message if shape in TOPICS else _USER_TYPES.get(shape)
 
 
 def register_sensors(sensors: Iterable[SensorInfo]) -> None:
@@ -308,8 +312,8 @@ def register_messages(kinds: Iterable[type[AgentMessage]]) -> None:
 
 
 def _register(shape: str, kind: type[Struct]) -> None:
-    if _OWN.get(shape) is not kind:
-        _OWN[shape] = kind
+    if _USER_TYPES.get(shape) is not kind:
+        _USER_TYPES[shape] = kind
         for by_key in (type_of, is_output, encoding, _reader_of):
             by_key.cache_clear()
 
@@ -350,8 +354,8 @@ def output_type(key: str) -> type[Struct]:
         raise DecodeError(f"{key:.80}: is not a key of the contract; see docs/protocol.md")
     if not is_output(key):
         todo = "return it from `views`" if key.startswith("view/") else "only the process that owns it writes there"
-        what = "is not a key of an agent's outputs (commands, estimates, states, messages)"
-        raise DecodeError(f"{key:.80}: {what}; {todo}")
+        reason = "is not a key of an agent's outputs (commands, estimates, states, messages)"
+        raise DecodeError(f"{key:.80}: {reason}; {todo}")
     return kind
 
 

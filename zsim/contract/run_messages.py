@@ -29,8 +29,8 @@ class Waiting(Struct, frozen=True):
 
     def __str__(self) -> str:
         on = f" on {self.host}" if self.host else ""
-        held = f", held by {', '.join(self.held_by)}" if self.held_by else ""
-        return f"{self.name}{on} ({self.since_wall_s:.1f} s{held})"
+        holders = f", held by {', '.join(self.held_by)}" if self.held_by else ""
+        return f"{self.name}{on} ({self.since_wall_s:.1f} s{holders})"
 
 
 def holding_up(state: str, waiting: Sequence[Waiting]) -> Sequence[Waiting]:
@@ -38,15 +38,15 @@ def holding_up(state: str, waiting: Sequence[Waiting]) -> Sequence[Waiting]:
 
     While the run is running, waits of up to SOON_S are normal and do not count.
     """
-    late = [each for each in waiting if state == "waiting" or each.since_wall_s > SOON_S]
-    return [each for each in late if not each.held_by] or late
+    delayed = [each for each in waiting if state == "waiting" or each.since_wall_s > SOON_S]
+    return [each for each in delayed if not each.held_by] or delayed
 
 
 def waiting_text(state: str, waiting: Sequence[Waiting]) -> str:
     """Return "waiting for" and the processes that hold up a run (see `holding_up`); empty if there are none."""
-    late = holding_up(state, waiting)
-    more = [f"{len(late) - WAITING_SHOWN} more"] if len(late) > WAITING_SHOWN else []
-    return f"waiting for {', '.join([*map(str, late[:WAITING_SHOWN]), *more])}" if late else ""
+    blocking = holding_up(state, waiting)
+    remainder = [f"{len(blocking) - WAITING_SHOWN} more"] if len(blocking) > WAITING_SHOWN else []
+    return f"waiting for {', '.join([*map(str, blocking[:WAITING_SHOWN]), *remainder])}" if blocking else ""
 
 
 @on("clock", writers="world", readers="each", last="world")

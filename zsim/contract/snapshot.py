@@ -56,15 +56,17 @@ def checked(state: Any, owner: type) -> State | None:
     """
     if state is None:
         return None
-    what = f"{plugin.full_name(owner)}.snapshot returns"
+    context = f"{plugin.full_name(owner)}.snapshot returns"
     if not isinstance(state, dict) or not all(isinstance(name, str) for name in state):
-        raise UserCodeError(f"{what} {show(state)}; must be a map of plain values by name, {{}} if there is no state")
+        raise UserCodeError(
+            f"{context} {show(state)}; must be a map of plain values by name, {{}} if there is no state"
+        )
     try:
         pack(state)
     except (TypeError, *REFUSALS) as error:
-        path, found = next(_flaws(state), ("a value", str(error)))
+        path, actual = next(_flaws(state), ("a value", str(error)))
         allowed = "must be numbers, texts, bytes, lists, maps by name, or arrays of numbers"
-        raise UserCodeError(f"{what} {path} = {found}; {allowed}") from error
+        raise UserCodeError(f"{context} {path} = {actual}; {allowed}") from error
     return state
 
 
@@ -74,8 +76,8 @@ def _flaws(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
         for name, each in value.items():
             yield from _flaws(each, f"{path}.{name}" if path else str(name))
     elif isinstance(value, list | tuple):
-        for place, each in enumerate(value):
-            yield from _flaws(each, f"{path}[{place}]")
+        for index, each in enumerate(value):
+            yield from _flaws(each, f"{path}[{index}]")
     else:
         try:
             _ENCODER.encode(value)

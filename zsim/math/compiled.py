@@ -125,8 +125,8 @@ class Part:
 
 
 def _part(function: Function, options: dict[str, Any]) -> Function:
-    made: Any = Part(function, options) if COMPILES else function
-    return made
+    part: Any = Part(function, options) if COMPILES else function
+    return part
 
 
 def compiled(function: Function) -> Function:
@@ -201,8 +201,8 @@ class Deferred(Part):
 def deferred(makes_arrays: bool = True) -> Callable[[Function], Function]:
     """Return a decorator as `kernel` does, for mathematics that is also used while a run is set up."""
     options = _EXACT if makes_arrays else {**_EXACT, **_UNCOUNTED}
-    made: Any = lambda function: Deferred(function, options) if COMPILES else function  # noqa: E731
-    return made
+    decorator: Any = lambda function: Deferred(function, options) if COMPILES else function  # noqa: E731
+    return decorator
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
@@ -234,8 +234,8 @@ def _imported(module: str) -> tuple[str, ...]:
     """Return the modules of zsim that a loaded module imports."""
     text = Path(str(sys.modules[module].__file__)).read_text(encoding="utf-8")
     lines = _IMPORTS.findall(text)  # packages, with the modules or names imported from each
-    named = [name for package, names in lines for name in (package, *(f"{package}.{n}" for n in _NAME.findall(names)))]
-    return tuple(name for name in named if getattr(sys.modules.get(name), "__file__", None))
+    found = [name for package, names in lines for name in (package, *(f"{package}.{n}" for n in _NAME.findall(names)))]
+    return tuple(name for name in found if getattr(sys.modules.get(name), "__file__", None))
 
 
 def digest(files: Iterable[Path]) -> str:
@@ -275,5 +275,5 @@ def columns(name: str, fields: Iterable[Field]) -> Columns:
     """
     listed = tuple(fields)
     first = [0, *accumulate(field.width for field in listed)]
-    places: Any = namedtuple(name, [*(field.name for field in listed), "size"])  # type: ignore[misc]
-    return places(*first)
+    column_type: Any = namedtuple(name, [*(field.name for field in listed), "size"])  # type: ignore[misc]
+    return column_type(*first)

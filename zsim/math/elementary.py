@@ -97,15 +97,15 @@ def sin_cos(x: float) -> tuple[float, float]:
     a = x - turns * _PI_A
     b = turns * _PI_B
     r = a - b
-    rest = ((a - r) - b) - turns * _PI_C  # the reduced angle is r + rest, |r| <= pi / 4
+    remainder = ((a - r) - b) - turns * _PI_C  # the reduced angle is r + remainder, |r| <= pi / 4
     z = r * r
     odd = z * (1.0 / 6227020800.0 + z * (-1.0 / 1307674368000.0 + z / 355687428096000.0))
     odd = z * z * (1.0 / 120.0 + z * (-1.0 / 5040.0 + z * (1.0 / 362880.0 + z * (-1.0 / 39916800.0 + odd))))
-    sine = r + (r * (z * (-1.0 / 6.0) + odd) + rest * (1.0 - 0.5 * z))
+    sine = r + (r * (z * (-1.0 / 6.0) + odd) + remainder * (1.0 - 0.5 * z))
     even = z * (1.0 / 479001600.0 + z * (-1.0 / 87178291200.0 + z / 20922789888000.0))
     even = z * z * (1.0 / 24.0 + z * (-1.0 / 720.0 + z * (1.0 / 40320.0 + z * (-1.0 / 3628800.0 + even))))
-    near = 1.0 - 0.5 * z
-    cosine = near + (((1.0 - near) - 0.5 * z) + (even - r * rest))
+    leading = 1.0 - 0.5 * z
+    cosine = leading + (((1.0 - leading) - 0.5 * z) + (even - r * remainder))
     quadrant = turns - 4.0 * math.floor(0.25 * turns)
     if quadrant == 0.0:
         return sine, cosine
@@ -221,12 +221,12 @@ def power(x: float, y: float) -> float:
     """Return x to the power of y; for whole y from -64 to 64, by multiplications."""
     is_whole = y % 1.0 == 0.0
     if is_whole and abs(y) <= 64.0:
-        left, product, factor = int(abs(y)), 1.0, x
-        while left > 0:
-            if left & 1:
+        remaining, product, factor = int(abs(y)), 1.0, x
+        while remaining > 0:
+            if remaining & 1:
                 product *= factor
             factor *= factor
-            left >>= 1
+            remaining >>= 1
         return product if y >= 0.0 else 1.0 / product if product != 0.0 else math.copysign(math.inf, product)
     if x == 0.0:
         return 0.0 if y > 0.0 else math.inf
@@ -264,7 +264,7 @@ def elementwise(function: Callable[..., float]) -> Callable[..., NDArray[np.floa
     """Return a function of numbers as a function of arrays, which are broadcast against each other."""
 
     def of_arrays(*arrays: ArrayLike) -> NDArray[np.float64]:
-        over = np.frompyfunc(function, len(arrays), 1)
-        return np.asarray(over(*(np.asarray(a, dtype=float) for a in arrays)), dtype=float)
+        vectorized = np.frompyfunc(function, len(arrays), 1)
+        return np.asarray(vectorized(*(np.asarray(a, dtype=float) for a in arrays)), dtype=float)
 
     return of_arrays

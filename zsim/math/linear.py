@@ -121,10 +121,10 @@ def _solved(A: Array, B: Array) -> Array:
                     B[i, j] -= factor * B[k, j]
     for k in range(n - 1, -1, -1):
         for j in range(m):
-            rest = B[k, j]
+            remainder = B[k, j]
             for i in range(k + 1, n):
-                rest -= A[k, i] * B[i, j]
-            B[k, j] = rest / A[k, k]
+                remainder -= A[k, i] * B[i, j]
+            B[k, j] = remainder / A[k, k]
     return B
 
 
@@ -153,10 +153,10 @@ def _banded_solved(A: Array, below: int, B: Array) -> Array:
                     B[i, j] -= factor * B[k, j]
     for k in range(n - 1, -1, -1):
         for j in range(m):
-            rest = B[k, j]
+            remainder = B[k, j]
             for i in range(k + 1, min(n, k + right)):
-                rest -= A[k, i - k + below] * B[i, j]
-            B[k, j] = rest / A[k, below]
+                remainder -= A[k, i - k + below] * B[i, j]
+            B[k, j] = remainder / A[k, below]
     return B
 
 

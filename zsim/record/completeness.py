@@ -35,14 +35,14 @@ class GateCount:
     """Counts the gates of a run by its clock messages, in the order in which the world published them.
 
     Args:
-        after: clock message after which counting begins; None for the start of the run.
+        previous: clock message after which counting begins; None for the start of the run.
     """
 
-    def __init__(self, after: run_messages.Clock | None = None) -> None:
+    def __init__(self, previous: run_messages.Clock | None = None) -> None:
         self.gates = 0  # number of gates so far
         self.gaps: list[GateGap] = []  # gaps so far
         self.ended = False  # whether the last clock message stated the end of the run
-        self._step, self._seq = (after.step, after.seq) if after else (-1, -1)
+        self._step, self._seq = (previous.step, previous.seq) if previous else (-1, -1)
 
     def add(self, clock: run_messages.Clock) -> GateGap | None:
         """Count the gate of a clock message; return the gates missing before it, or None.
@@ -85,8 +85,10 @@ class Completeness(Struct, frozen=True):
     def faults(self) -> list[str]:
         faults = []
         if self.gaps:
-            of = self.gates + self.gates_missing
-            faults.append(f"{self.gates_missing} of {of} gates are missing: {shown([str(gap) for gap in self.gaps])}")
+            total = self.gates + self.gates_missing
+            faults.append(
+                f"{self.gates_missing} of {total} gates are missing: {shown([str(gap) for gap in self.gaps])}"
+            )
         elif self.messages_missing:
             faults.append(f"{self.messages_missing} messages of the world are missing")
         if not self.ended:
@@ -112,25 +114,25 @@ _WIDTH[[0xCC, 0xCD, 0xCE, 0xCF]] = 1, 2, 4, 8
 _T_NS, _SEQ = (np.frombuffer(msgspec.msgpack.encode(name), np.uint8) for name in ("t_ns", "seq"))
 _MAP_16 = 0xDE  # first byte of a map of more than 15 fields
 SECOND_NS = 1_000_000_000
-_LOOKED_AT = 1 << 5  # bytes of padding; the first two fields of a message always end within this length
+_PADDING_BYTES = 1 << 5  # bytes of padding; the first two fields of a message always end within this length
 
 
 def sequence_numbers(spans: MessageSpans) -> NDArray[np.int64]:
     """Return `seq` of each message, (M,); UNREAD for messages that do not begin with `t_ns` and `seq`."""
-    data = np.frombuffer(spans.content + bytes(_LOOKED_AT), np.uint8)
+    data = np.frombuffer(spans.content + bytes(_PADDING_BYTES), np.uint8)
     start = spans.start
     first = start + np.where(data[start] == _MAP_16, 3, 1)
     width = _WIDTH[data[first + len(_T_NS)]]
     second = first + len(_T_NS) + 1 + width
-    known = (data[first[:, None] + np.arange(len(_T_NS))] == _T_NS).all(axis=1) & (width >= 0)
-    known &= (data[second[:, None] + np.arange(len(_SEQ))] == _SEQ).all(axis=1)
+    is_readable = (data[first[:, None] + np.arange(len(_T_NS))] == _T_NS).all(axis=1) & (width >= 0)
+    is_readable &= (data[second[:, None] + np.arange(len(_SEQ))] == _SEQ).all(axis=1)
     tag = data[second + len(_SEQ)].astype(np.int64)
     width = _WIDTH[tag]
     value = second + len(_SEQ) + 1
-    known &= (width >= 0) & (value + width <= spans.end)
-    numbers = np.where(known & (width == 0), tag, UNREAD)
+    is_readable &= (width >= 0) & (value + width <= spans.end)
+    numbers = np.where(is_readable & (width == 0), tag, UNREAD)
     for size in (1, 2, 4, 8):
-        rows = np.flatnonzero(known & (width == size))
+        rows = np.flatnonzero(is_readable & (width == size))
         written = data[value[rows, None] + np.arange(size)]
         numbers[rows] = np.ascontiguousarray(written).view(f">u{size}")[:, 0].astype(np.int64)
     return numbers
@@ -183,17 +185,17 @@ def completeness(
     external = {drone.name for drone in (info.drones if info else ()) if drone.body is not msgspec.UNSET}
     names = reader.channels()
     numbered = {n for n, key in names.items() if not is_replay and _is_numbered(key, external)}
-    of_clock = {n for n, key in names.items() if key == keys.CLOCK}
-    beside = {n for n, key in names.items() if key in keys_beside}
+    clock_channels = {n for n, key in names.items() if key == keys.CLOCK}
+    extra = {n for n, key in names.items() if key in keys_beside}
     sampled = {n for n, key in names.items() if key in keys_sampled}
     numbers = _Numbers()
     clocks: list[run_messages.Clock] = []
     decode = msgspec.msgpack.Decoder(run_messages.Clock).decode
-    for spans in reader.spans(numbered | of_clock | beside | sampled):
-        is_clock = np.isin(spans.channel, list(of_clock))
+    for spans in reader.spans(numbered | clock_channels | extra | sampled):
+        is_clock = np.isin(spans.channel, list(clock_channels))
         numbers.add(spans, np.isin(spans.channel, list(numbered)))
-        wanted = np.flatnonzero(np.isin(spans.channel, list(beside)) | _one_each_second(spans, sampled))
-        for m in wanted[np.argsort(spans.start[wanted])].tolist():
+        selected = np.flatnonzero(np.isin(spans.channel, list(extra)) | _one_each_second(spans, sampled))
+        for m in selected[np.argsort(spans.start[selected])].tolist():
             take(names[spans.channel.item(m)], spans.content[spans.start.item(m) : spans.end.item(m)])
         for start, end in zip(spans.start[is_clock].tolist(), spans.end[is_clock].tolist(), strict=True):
             with suppress(*messages.REFUSALS):  # another program's garbage is recorded as received
@@ -234,7 +236,7 @@ def record_completeness(path: Path) -> Completeness:
 
 def _is_numbered(key: str, external: Container[str]) -> bool:
     """Return whether only the world publishes on a key, numbering without gaps; False for keys of external drones."""
-    group, drone, what = keys.parts(key)
+    group, drone, topic = keys.parts(key)
     if group != "drone":
         return key == keys.EVENT
-    return keys.is_accepted(key) or (drone not in external and (what == "truth" or what.startswith("sensor/")))
+    return keys.is_accepted(key) or (drone not in external and (topic == "truth" or topic.startswith("sensor/")))

@@ -54,7 +54,8 @@ FOOTER_SIZE = HEAD.size + 20
 CHUNK_MAX = 1 << 27  # maximum bytes of a chunk's content; zsim's has up to 1 MB and one message of at most 16 MB
 # Maximum bytes of a schema, a channel or a part of the summary; statistics of 65 535 channels take 0.7 MB
 SMALL_MAX = 1 << 20
-LEAST = {Opcode.CHUNK: CHUNK_HEAD.size + SIZE.size, Opcode.MESSAGE_INDEX: INDEX_HEAD.size}  # minimum length of a body
+# Minimum length of a body
+SIZES_MIN = {Opcode.CHUNK: CHUNK_HEAD.size + SIZE.size, Opcode.MESSAGE_INDEX: INDEX_HEAD.size}
 
 PIECE_BYTES = 1 << 24  # maximum bytes mapped while reading a whole file; mapped pages count as memory in use
 Source = bytes | mmap
@@ -124,22 +125,22 @@ def packed(record: McapRecord) -> bytes:
     return builder.end()
 
 
-def unpacked(kind: type[Known], source: Source, place: RecordSpan) -> Known:
+def unpacked(kind: type[Known], source: Source, span: RecordSpan) -> Known:
     """Return the schema or channel at a position; raise RecordError if it is damaged."""
     try:
-        return kind.read(ReadDataStream(BytesIO(source[place.body : place.end])))
+        return kind.read(ReadDataStream(BytesIO(source[span.body : span.end])))
     except (struct.error, McapError, UnicodeDecodeError) as error:
-        reason = f"the {kind.__name__.lower()} at byte {place.start} is damaged ({type(error).__name__})"
+        reason = f"the {kind.__name__.lower()} at byte {span.start} is damaged ({type(error).__name__})"
         raise RecordError(f"{reason}; the record cannot be read") from error
 
 
-def places(source: Source) -> Iterator[RecordSpan]:
+def record_spans(source: Source) -> Iterator[RecordSpan]:
     """Yield the complete records of a file up to its footer, a truncated record, or an invalid opcode or length."""
     at, size = len(MAGIC), len(source)
     while at + HEAD.size <= size:
         opcode, length = HEAD.unpack_from(source, at)
         end = at + HEAD.size + length
-        if end > size or opcode not in _STANDARD or length < LEAST.get(opcode, 0):
+        if end > size or opcode not in _STANDARD or length < SIZES_MIN.get(opcode, 0):
             return
         yield RecordSpan(opcode, at, end)
         if opcode == Opcode.FOOTER:
@@ -152,43 +153,43 @@ def is_cut(source: Source, at: int) -> bool:
 
     Otherwise they are damaged: a wrong length makes everything after it unreadable.
     """
-    left = len(source) - at - HEAD.size
-    if left < 0:
+    remaining = len(source) - at - HEAD.size
+    if remaining < 0:
         return True
     opcode, length = HEAD.unpack_from(source, at)
-    if opcode not in _STANDARD or length < LEAST.get(opcode, 0):
+    if opcode not in _STANDARD or length < SIZES_MIN.get(opcode, 0):
         return False
-    if opcode not in LEAST:
+    if opcode not in SIZES_MIN:
         return opcode in _ANY_SIZE or length <= SMALL_MAX
-    if left < CUT_HEAD:
+    if remaining < CUT_HEAD:
         return True
-    place = RecordSpan(opcode, at, len(source))  # a chunk or message index, whose length follows from its fields
+    span = RecordSpan(opcode, at, len(source))  # a chunk or message index, whose length follows from its fields
     if opcode == Opcode.MESSAGE_INDEX:
-        return length == INDEX_HEAD.size + INDEX_HEAD.unpack_from(source, place.body)[1]
-    content = chunk_head(source, place).content
-    return content <= len(source) and length == content - place.body + SIZE.unpack_from(source, content - SIZE.size)[0]
+        return length == INDEX_HEAD.size + INDEX_HEAD.unpack_from(source, span.body)[1]
+    content = chunk_head(source, span).content
+    return content <= len(source) and length == content - span.body + SIZE.unpack_from(source, content - SIZE.size)[0]
 
 
-def groups(source: Source, found: Iterator[RecordSpan] | None = None) -> Iterator[RecordGroup]:
+def groups(source: Source, spans: Iterator[RecordSpan] | None = None) -> Iterator[RecordGroup]:
     """Yield schemas, channels and chunks of the data section in order.
 
     Args:
-        found: positions of the records, if already known.
+        spans: positions of the records, if already known.
     """
     last: RecordSpan | None = None  # the record whose message indexes may follow
     indexes: list[Index] = []
     end = 0
-    for place in found or places(source):
-        if place.opcode == Opcode.DATA_END:
+    for span in spans or record_spans(source):
+        if span.opcode == Opcode.DATA_END:
             break
-        if place.opcode == Opcode.MESSAGE_INDEX:
-            channel, size = INDEX_HEAD.unpack_from(source, place.body)
-            indexes.append(Index(channel, size // INDEX_ENTRY, place.start))
+        if span.opcode == Opcode.MESSAGE_INDEX:
+            channel, size = INDEX_HEAD.unpack_from(source, span.body)
+            indexes.append(Index(channel, size // INDEX_ENTRY, span.start))
         else:
             if last is not None:
                 yield RecordGroup(last, tuple(indexes), end)
-            last, indexes = place if place.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK) else None, []
-        end = place.end
+            last, indexes = span if span.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK) else None, []
+        end = span.end
     if last is not None:
         yield RecordGroup(last, tuple(indexes), end)
 
@@ -207,24 +208,24 @@ def chunk(content: bytes | memoryview, first_ns: int, last_ns: int) -> list[byte
     return [HEAD.pack(Opcode.CHUNK, length), head, ZSTD, SIZE.pack(len(data)), data]
 
 
-def chunk_head(source: Source, place: RecordSpan) -> ChunkHead:
-    first, last, size, crc, name = CHUNK_HEAD.unpack_from(source, place.body)
-    at = place.body + CHUNK_HEAD.size
+def chunk_head(source: Source, span: RecordSpan) -> ChunkHead:
+    first, last, size, crc, name = CHUNK_HEAD.unpack_from(source, span.body)
+    at = span.body + CHUNK_HEAD.size
     return ChunkHead(first, last, size, crc, source[at : at + name].decode("utf-8", "replace"), at + name + SIZE.size)
 
 
-def content_of(source: Source, place: RecordSpan) -> bytes | None:
+def content_of(source: Source, span: RecordSpan) -> bytes | None:
     """Return the message records of the chunk at a position; None if it is damaged or larger than CHUNK_MAX.
 
     Raises:
         RecordError: its compression is not supported.
     """
-    head = chunk_head(source, place)
-    if head.content > place.end or head.size > CHUNK_MAX:
+    head = chunk_head(source, span)
+    if head.content > span.end or head.size > CHUNK_MAX:
         return None
     if head.compression not in ("zstd", ""):
         raise RecordError(f"a chunk is compressed with {head.compression[:20]!r}; allowed: zstd or none")
-    content = source[head.content : place.end]
+    content = source[head.content : span.end]
     if head.compression:
         try:
             if zstandard.frame_content_size(content) not in (SIZE_UNSTATED, head.size):
@@ -246,7 +247,7 @@ def write_all(file: FileIO, data: bytes) -> None:
 def crc_until(source: Source, end: int) -> int:
     crc = 0
     for start in range(0, end, PIECE_BYTES):
-        with memoryview(source) as whole, whole[start : min(end, start + PIECE_BYTES)] as piece:
+        with memoryview(source) as view, view[start : min(end, start + PIECE_BYTES)] as piece:
             crc = zlib.crc32(piece, crc)
         unmap(source)
     return crc
@@ -277,9 +278,9 @@ def indexes_of(content: bytes) -> dict[int, list[int]]:
     return indexes
 
 
-def heads_at(content: bytes, places: NDArray[np.int64]) -> NDArray:
+def heads_at(content: bytes, offsets: NDArray[np.int64]) -> NDArray:
     """Return the heads, of type MESSAGE_HEAD, of the messages at some positions in a chunk's content."""
-    return np.ndarray(max(0, len(content) - MESSAGE.size + 1), MESSAGE_HEAD, content, strides=(1,))[places]
+    return np.ndarray(max(0, len(content) - MESSAGE.size + 1), MESSAGE_HEAD, content, strides=(1,))[offsets]
 
 
 def index_record(channel: int, entries: bytes) -> bytes:

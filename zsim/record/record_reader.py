@@ -48,7 +48,7 @@ class _Chunk(NamedTuple):
     indexes: tuple[layout.Index, ...]
 
 
-_Held = tuple[int, int, Recorded]  # simulated time, number of the message's chunk, message
+_Straggler = tuple[int, int, Recorded]  # simulated time, number of the message's chunk, message
 
 
 class RecordReader:
@@ -78,7 +78,7 @@ class RecordReader:
         self.complete = layout.is_complete(self._source)  # whether the record was closed
         self._keys: dict[int, str] = {}
         self._data_end: layout.RecordSpan | None = None
-        self._rest: int | None = None  # start of the unreadable end; None if all is readable
+        self._unreadable_from: int | None = None  # start of the unreadable end; None if all is readable
         self._damaged: set[layout.RecordSpan] = set()  # chunks
         self._chunks = list(self._scan())
 
@@ -98,8 +98,8 @@ class RecordReader:
             from_ns: chunks with only older messages are skipped; a chunk spans a quarter of a wall second.
         """
         wanted = {number: key for number, key in self._keys.items() if keys is None or key in keys}
-        late = (chunk for chunk in self._chunks if chunk.last_ns >= from_ns)
-        chunks = [chunk for chunk in late if not chunk.channels.isdisjoint(wanted)]
+        candidates = (chunk for chunk in self._chunks if chunk.last_ns >= from_ns)
+        chunks = [chunk for chunk in candidates if not chunk.channels.isdisjoint(wanted)]
         return self._by_time(chunks, wanted) if by_time else self._as_written(chunks, wanted)
 
     def __iter__(self) -> Iterator[Recorded]:
@@ -118,13 +118,13 @@ class RecordReader:
             if content is None:
                 self._damaged.add(chunk.place)
                 continue
-            channel, places = self._indexed(chunk, content)
+            channel, offsets = self._indexed(chunk, content)
             mapped += chunk.place.end - chunk.place.start
             if mapped > layout.PIECE_BYTES:
                 layout.unmap(self._source)
                 mapped = 0
             rows = np.isin(channel, list(wanted))
-            starts = places[rows]
+            starts = offsets[rows]
             heads = layout.heads_at(content, starts)
             ends = starts + layout.HEAD.size + heads["length"].astype(np.int64)
             times = heads["log_time"].astype(np.int64)
@@ -136,17 +136,17 @@ class RecordReader:
         at = [(index.start + head, layout.INDEX_ENTRY * index.messages) for index in chunk.indexes]
         data = b"".join([self._source[start : start + size] for start, size in at])
         if data and len(data) == sum(size for _, size in at):  # a damaged size may point beyond the end of the file
-            places = np.frombuffer(data, "<u8")[1::2].astype(np.int64)
+            offsets = np.frombuffer(data, "<u8")[1::2].astype(np.int64)
             channel = np.repeat([index.channel for index in chunk.indexes], [index.messages for index in chunk.indexes])
-            if places.min() >= 0 and places.max() <= len(content) - layout.MESSAGE.size:
-                heads = layout.heads_at(content, places)
-                is_whole = int(heads["length"].sum()) + layout.HEAD.size * len(places) == len(content)
-                if is_whole and (heads["opcode"] == Opcode.MESSAGE).all() and (heads["channel"] == channel).all():
-                    return channel.astype(np.int64), places
-        found = layout.indexes_of(content)
-        channel = np.repeat(list(found), [len(each) // 2 for each in found.values()])
-        places = [place for each in found.values() for place in each[1::2]]
-        return channel.astype(np.int64), np.array(places, dtype=np.int64)
+            if offsets.min() >= 0 and offsets.max() <= len(content) - layout.MESSAGE.size:
+                heads = layout.heads_at(content, offsets)
+                is_complete = int(heads["length"].sum()) + layout.HEAD.size * len(offsets) == len(content)
+                if is_complete and (heads["opcode"] == Opcode.MESSAGE).all() and (heads["channel"] == channel).all():
+                    return channel.astype(np.int64), offsets
+        indexes = layout.indexes_of(content)
+        channel = np.repeat(list(indexes), [len(each) // 2 for each in indexes.values()])
+        offsets = [offset for each in indexes.values() for offset in each[1::2]]
+        return channel.astype(np.int64), np.array(offsets, dtype=np.int64)
 
     @property
     def damaged(self) -> tuple[str, ...]:
@@ -154,7 +154,9 @@ class RecordReader:
         heads = [(place.start, layout.chunk_head(self._source, place)) for place in sorted(self._damaged)]
         span = "the chunk at byte {}, {:.2f} to {:.2f} s"
         chunks = [span.format(at, head.first_ns / 1e9, head.last_ns / 1e9) for at, head in heads]
-        return tuple(chunks if self._rest is None else [*chunks, f"everything from byte {self._rest} on"])
+        return tuple(
+            chunks if self._unreadable_from is None else [*chunks, f"everything from byte {self._unreadable_from} on"]
+        )
 
     def differs(self) -> bool:
         """Return whether a record was changed after its writer closed it; read the whole file.
@@ -182,9 +184,9 @@ class RecordReader:
         channels = {number for number, name in self._keys.items() if name == key}
         for chunk in reversed([chunk for chunk in self._chunks if not chunk.channels.isdisjoint(channels)]):
             written = list(self._as_written([chunk], self._keys))
-            places = [i for i, each in enumerate(written) if each.key == key and is_it(each.payload)]
-            if places:
-                return chunk.place.start, written[: places[-1]]
+            matches = [i for i, each in enumerate(written) if each.key == key and is_it(each.payload)]
+            if matches:
+                return chunk.place.start, written[: matches[-1]]
         return None
 
     def close(self) -> None:
@@ -197,37 +199,37 @@ class RecordReader:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _places(self) -> Iterator[layout.RecordSpan]:
+    def _record_spans(self) -> Iterator[layout.RecordSpan]:
         """Yield all records, noting the channels (possibly only in the summary) and the data end."""
         opcode, end = 0, len(layout.MAGIC)
-        for place in layout.places(self._source):
-            opcode, end = place.opcode, place.end
+        for span in layout.record_spans(self._source):
+            opcode, end = span.opcode, span.end
             if opcode == Opcode.CHANNEL:
-                channel = layout.unpacked(Channel, self._source, place)
+                channel = layout.unpacked(Channel, self._source, span)
                 self._keys[channel.id] = channel.topic
             elif opcode == Opcode.DATA_END:
-                self._data_end = self._data_end or place
-            yield place
+                self._data_end = self._data_end or span
+            yield span
         if opcode != Opcode.FOOTER and (self.complete or not layout.is_cut(self._source, end)):
-            self._rest = end
+            self._unreadable_from = end
 
     def _scan(self) -> Iterator[_Chunk]:
-        known: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
-        found = self._places()
-        chunk_groups = [group for group in layout.groups(self._source, found) if group.place.opcode == Opcode.CHUNK]
-        for _ in found:  # read the channels in the summary
+        channel_sets: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
+        spans = self._record_spans()
+        chunk_groups = [group for group in layout.groups(self._source, spans) if group.place.opcode == Opcode.CHUNK]
+        for _ in spans:  # read the channels in the summary
             continue
-        for place, indexes, _ in chunk_groups:
+        for span, indexes, _ in chunk_groups:
             counts = {index.channel: index.messages for index in indexes}
-            if place is chunk_groups[-1].place and not self.complete:  # its indexes may be truncated
-                content = layout.content_of(self._source, place)
+            if span is chunk_groups[-1].place and not self.complete:  # its indexes may be truncated
+                content = layout.content_of(self._source, span)
                 if content is None:
-                    self._damaged.add(place)
+                    self._damaged.add(span)
                 counts = {channel: len(entries) // 2 for channel, entries in layout.indexes_of(content or b"").items()}
                 indexes = ()
             self._counts.update(counts)
-            head, channels = layout.chunk_head(self._source, place), frozenset(counts)
-            yield _Chunk(place, head.first_ns, head.last_ns, known.setdefault(channels, channels), indexes)
+            head, channels = layout.chunk_head(self._source, span), frozenset(counts)
+            yield _Chunk(span, head.first_ns, head.last_ns, channel_sets.setdefault(channels, channels), indexes)
 
     def _as_written(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
         for chunk in chunks:
@@ -240,38 +242,38 @@ class RecordReader:
                 at, end = 0, len(content) - payload
                 while at <= end:
                     opcode, length, number, _, t_ns, wall_ns = unpack(content, at)
-                    after = at + head + length
+                    record_end = at + head + length
                     if number in wanted and opcode == Opcode.MESSAGE:
-                        yield Recorded(wanted[number], content[at + payload : after], t_ns, wall_ns)
-                    at = after
+                        yield Recorded(wanted[number], content[at + payload : record_end], t_ns, wall_ns)
+                    at = record_end
                 continue
-            channel, places = self._indexed(chunk, content)
-            for at in np.sort(places[np.isin(channel, list(wanted))]).tolist():
+            channel, offsets = self._indexed(chunk, content)
+            for at in np.sort(offsets[np.isin(channel, list(wanted))]).tolist():
                 _, length, number, _, t_ns, wall_ns = unpack(content, at)
                 yield Recorded(wanted[number], content[at + payload : at + head + length], t_ns, wall_ns)
 
     def _by_time(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
         """Yield messages by time, holding in memory only the chunks that overlap in time, and stragglers."""
-        held, floors = self._stragglers(chunks, wanted)
+        stragglers, floors = self._stragglers(chunks, wanted)
         starts = [floors.get(number, chunk.first_ns) for number, chunk in enumerate(chunks)]
         for number in sorted(range(len(chunks)), key=starts.__getitem__):
             first_ns, floor_ns = starts[number], floors.get(number, 0)
-            held.sort(key=itemgetter(0, 1))
-            ready = next((i for i, (t_ns, _, _) in enumerate(held) if t_ns >= first_ns), len(held))
-            yield from (message for _, _, message in held[:ready])
-            del held[:ready]
+            stragglers.sort(key=itemgetter(0, 1))
+            ready = next((i for i, (t_ns, _, _) in enumerate(stragglers) if t_ns >= first_ns), len(stragglers))
+            yield from (message for _, _, message in stragglers[:ready])
+            del stragglers[:ready]
             entries = self._as_written([chunks[number]], wanted)
-            held += [(m.t_ns, number, m) for m in entries if m.t_ns >= floor_ns]
-        held.sort(key=itemgetter(0, 1))
-        yield from (message for _, _, message in held)
+            stragglers += [(m.t_ns, number, m) for m in entries if m.t_ns >= floor_ns]
+        stragglers.sort(key=itemgetter(0, 1))
+        yield from (message for _, _, message in stragglers)
 
-    def _stragglers(self, chunks: list[_Chunk], wanted: dict[int, str]) -> tuple[list[_Held], dict[int, int]]:
+    def _stragglers(self, chunks: list[_Chunk], wanted: dict[int, str]) -> tuple[list[_Straggler], dict[int, int]]:
         """Return messages stamped long before the rest of their chunk, and by chunk the first time of the rest [ns].
 
         A program that does not stamp its messages puts one of time 0 into every chunk. If chunks were ordered by their
         oldest messages, all would be read and held at the beginning.
         """
-        strays: list[_Held] = []
+        strays: list[_Straggler] = []
         floors: dict[int, int] = {}
         for number in range(1, len(chunks)):
             chunk = chunks[number]
@@ -280,8 +282,9 @@ class RecordReader:
             entries = [(m.t_ns, number, m) for m in self._as_written([chunk], wanted)]
             floor_ns = 0  # below most times of the chunk, robust against a few outliers on either side
             if times := sorted(t_ns for t_ns, _, _ in entries):
-                middle, late = times[len(times) // 2], times[3 * len(times) // 4]
-                floor_ns = middle - 3 * (late - middle) - OVERLAP_NS  # 2 (late - middle) suffices for uniform times
+                # 2 (third quartile - middle) suffices for uniform times
+                middle, third_quartile = times[len(times) // 2], times[3 * len(times) // 4]
+                floor_ns = middle - 3 * (third_quartile - middle) - OVERLAP_NS
             strays += (each for each in entries if each[0] < floor_ns)
             floors[number] = min((t_ns for t_ns, _, _ in entries if t_ns >= floor_ns), default=chunk.first_ns)
         return strays, floors
@@ -298,5 +301,5 @@ def record_notes(reader: RecordReader) -> list[str]:
 
 
 def shown(texts: Sequence[str]) -> str:
-    more = len(texts) - SHOWN
-    return ", ".join(texts[:SHOWN]) + (f" and {more} more" if more > 0 else "")
+    remainder = len(texts) - SHOWN
+    return ", ".join(texts[:SHOWN]) + (f" and {remainder} more" if remainder > 0 else "")

@@ -61,7 +61,7 @@ class RecordWriter:
         self._schemas: dict[str, int] = {}
         self._ahead: list[bytes] = []  # new schemas and channels of the open chunk, written before it
         self._open = OpenChunk(CHUNK_BYTES + CHUNK_BYTES // 4)
-        self._seen = (0, 0)  # end of the file at an earlier tick, and wall time of that tick
+        self._last_tick = (0, 0)  # end of the file at an earlier tick, and wall time of that tick
         self._end = 0  # end of the last complete chunk in the file
         self._error = ""
         self._file = _opened(self.path, "r+" if goes_on else "x+")
@@ -69,7 +69,7 @@ class RecordWriter:
             self._append(layout.opening())
             return
         try:
-            self._take_up()
+            self._continue_file()
         except OSError as error:
             self._file.close()
             raise RecordError(f"{path}: cannot be continued ({error.strerror})") from error
@@ -77,9 +77,9 @@ class RecordWriter:
             self._file.close()
             raise
 
-    def _take_up(self) -> None:
+    def _continue_file(self) -> None:
         """Read the channels and schemas of the complete part of the file."""
-        _cut_off(self._file, self.path)
+        _truncate_file(self._file, self.path)
         counts: Counter[int] = Counter()
         self._end = self._file.seek(0, 2)
         with mmap(self._file.fileno(), 0, access=ACCESS_READ) as source:
@@ -139,7 +139,7 @@ class RecordWriter:
 
     def _channels_of(self, gate: GateMessages) -> bytes:
         """Return the channel of each message as int64; empty if channels are exhausted."""
-        names = [gate.table[place] for place in gate.which.tolist()]
+        names = [gate.table[index] for index in gate.which.tolist()]
         channels = [self._channels.get(key) or self._register(key, messages.encoding(key)) for key in names]
         return np.array(channels, dtype=np.int64).tobytes() if all(channels) else b""
 
@@ -148,9 +148,9 @@ class RecordWriter:
 
         `wall_ns` is from a monotonic clock; it is compared only with its own earlier values.
         """
-        end, since_ns = self._seen
+        end, since_ns = self._last_tick
         if not self._open.size or end != self._end:
-            self._seen = (self._end if self._open.size else 0, wall_ns)
+            self._last_tick = (self._end if self._open.size else 0, wall_ns)
         elif wall_ns - since_ns >= CHUNK_AGE_NS:
             self._end_chunk()
 
@@ -191,9 +191,9 @@ class RecordWriter:
         name = name or (kind.__name__ if kind else "")
         if name and name not in self._schemas:
             self._schemas[name] = number = len(self._schemas) + 1
-            known = kind is not None and kind.__name__ == name
-            text = msgspec.json.encode(msgspec.json.schema(kind)) if known else b""
-            self._ahead.append(layout.packed(Schema(number, text, "jsonschema" if known else "", name)))
+            is_known = kind is not None and kind.__name__ == name
+            text = msgspec.json.encode(msgspec.json.schema(kind)) if is_known else b""
+            self._ahead.append(layout.packed(Schema(number, text, "jsonschema" if is_known else "", name)))
         return self._schemas.get(name, 0)
 
     def _end_chunk(self) -> None:
@@ -348,21 +348,21 @@ class Content:
         heads["opcode"], heads["channel"] = int(Opcode.MESSAGE), self._channels
         heads["length"] = self._ends - self._starts - HEAD.size
         heads["log_time"], heads["publish_time"] = self._log, self._published
-        came = np.bincount(self._channels, minlength=len(counted))
-        before = np.pad(counted, (0, len(came) - len(counted)))
-        rank = np.arange(len(heads)) - np.repeat(np.cumsum(came) - came, came)
-        heads["sequence"][self._order] = (np.repeat(before, came) + rank) & _SEQUENCE_MASK
-        places = np.ndarray(len(self.data) - MESSAGE.size + 1, MESSAGE_HEAD, self.data, strides=(1,))
-        places[self._starts] = heads
-        return before + came
+        counts = np.bincount(self._channels, minlength=len(counted))
+        previous = np.pad(counted, (0, len(counts) - len(counted)))
+        rank = np.arange(len(heads)) - np.repeat(np.cumsum(counts) - counts, counts)
+        heads["sequence"][self._order] = (np.repeat(previous, counts) + rank) & _SEQUENCE_MASK
+        head_view = np.ndarray(len(self.data) - MESSAGE.size + 1, MESSAGE_HEAD, self.data, strides=(1,))
+        head_view[self._starts] = heads
+        return previous + counts
 
     def indexes(self) -> Iterator[bytes]:
-        places = self._starts[self._order].astype("Q")
-        entries = np.column_stack((self._log[self._order], places)).astype("<u8").tobytes()
-        came = np.bincount(self._channels)
+        offsets = self._starts[self._order].astype("Q")
+        entries = np.column_stack((self._log[self._order], offsets)).astype("<u8").tobytes()
+        counts = np.bincount(self._channels)
         at = 0
-        for channel in np.flatnonzero(came).tolist():
-            size = INDEX_ENTRY * int(came[channel])
+        for channel in np.flatnonzero(counts).tolist():
+            size = INDEX_ENTRY * int(counts[channel])
             yield HEAD.pack(Opcode.MESSAGE_INDEX, INDEX_HEAD.size + size) + INDEX_HEAD.pack(channel, size)
             yield entries[at : at + size]
             at += size
@@ -382,17 +382,17 @@ def cut_at_last(path: Path, key: str, is_it: Callable[[bytes], bool]) -> bool:
         RecordError: the file is not a record, cannot be written, or is being written by another process.
     """
     with RecordReader(path) as reader:
-        cut = reader.last_chunk(key, is_it)
-    if cut is None:
+        match = reader.last_chunk(key, is_it)
+    if match is None:
         return False
-    start, before = cut
+    start, earlier = match
     try:
         with open(path, "r+b") as file:
             file.truncate(start)
     except OSError as error:
         raise RecordError(f"{path}: cannot be cut ({error.strerror})") from error
     with RecordWriter(path, goes_on=True) as writer:
-        for each in before:
+        for each in earlier:
             writer.add(each.key, each.payload, messages.encoding(each.key), each.t_ns, each.wall_ns)
     return True
 
@@ -413,14 +413,14 @@ def repair(path: str | Path) -> bool:
                 with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
                     if layout.is_complete(source):
                         return False
-            _cut_off(file, path)
+            _truncate_file(file, path)
             _finish(file)
             return True
     except OSError as error:
         raise RecordError(f"{path}: cannot be repaired ({error.strerror})") from error
 
 
-def _cut_off(file: FileIO, path: Path) -> None:
+def _truncate_file(file: FileIO, path: Path) -> None:
     """Truncate a record after its last complete chunk, or else its header, so that it can be continued from there.
 
     Raises RecordError if the file is not a record, and OSError if it cannot be written.
@@ -430,16 +430,18 @@ def _cut_off(file: FileIO, path: Path) -> None:
         with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
             layout.check_magic(source, path)
             last: layout.RecordSpan | None = None
-            for place in layout.places(source):
-                if place.opcode == Opcode.DATA_END:
+            for span in layout.record_spans(source):
+                if span.opcode == Opcode.DATA_END:
                     break
-                if last is None or place.opcode == Opcode.CHUNK:
-                    last = place
+                if last is None or span.opcode == Opcode.CHUNK:
+                    last = span
             if last is not None:  # the indexes of the last chunk may be cut off
                 content = layout.content_of(source, last) if last.opcode == Opcode.CHUNK else None
-                found = layout.indexes_of(content or b"").items()
+                indexes = layout.indexes_of(content or b"").items()
                 end = last.end
-                tail = b"".join(layout.index_record(channel, np.array(own, "<u8").tobytes()) for channel, own in found)
+                tail = b"".join(
+                    layout.index_record(channel, np.array(own, "<u8").tobytes()) for channel, own in indexes
+                )
     file.truncate(end)
     file.seek(end)
     layout.write_all(file, tail)
@@ -469,25 +471,25 @@ def _summary(source: layout.Source) -> dict[Opcode, bytes]:
     messages: Counter[int] = Counter()
     first_ns, last_ns = 2**64 - 1, 0
     for group in layout.groups(source):
-        place, opcode = group.place, Opcode(group.place.opcode)
+        span, opcode = group.place, Opcode(group.place.opcode)
         if opcode == Opcode.SCHEMA:
-            layout.unpacked(Schema, source, place).write(schemas)
+            layout.unpacked(Schema, source, span).write(schemas)
         elif opcode == Opcode.CHANNEL:
-            layout.unpacked(Channel, source, place).write(channels)
+            layout.unpacked(Channel, source, span).write(channels)
         else:
-            head = layout.chunk_head(source, place)
-            if head.content > place.end:
+            head = layout.chunk_head(source, span)
+            if head.content > span.end:
                 continue  # the summary would refer readers to an unreadable chunk
             for index in group.indexes:
                 messages[index.channel] += index.messages
             first_ns, last_ns = min(first_ns, head.first_ns), max(last_ns, head.last_ns)
             ChunkIndex(
-                chunk_length=place.end - place.start,
-                chunk_start_offset=place.start,
+                chunk_length=span.end - span.start,
+                chunk_start_offset=span.start,
                 compression=head.compression,
-                compressed_size=place.end - head.content,
+                compressed_size=span.end - head.content,
                 message_end_time=head.last_ns,
-                message_index_length=group.end - place.end,
+                message_index_length=group.end - span.end,
                 message_index_offsets={index.channel: index.start for index in group.indexes},
                 message_start_time=head.first_ns,
                 uncompressed_size=head.size,

@@ -151,8 +151,8 @@ class Agent(ABC):
             outputs = self.step(t_ns)
             if self._is_own:
                 if not isinstance(outputs, list | tuple) or isinstance(outputs, Output):
-                    what = f"{plugin.full_name(type(self))}.step returns {show(outputs)}"
-                    raise UserCodeError(f"{what}; must return a list of outputs, which may be empty")
+                    context = f"{plugin.full_name(type(self))}.step returns {show(outputs)}"
+                    raise UserCodeError(f"{context}; must return a list of outputs, which may be empty")
                 outputs = [self._checked(t_ns, output) for output in outputs]
             return [Output(*sent) for sent in self._transmitter.send(t_ns, outputs)] if self._transmitter else outputs
         except plugin.RAISED as error:
@@ -335,9 +335,9 @@ class Agent(ABC):
         self._seq[key] = last + 1
 
 
-def default_name(made: Any) -> str:
+def default_name(factory: Any) -> str:
     """Return the process name of an agent without one, from its class or factory function."""
-    letters = re.sub(r"[^a-z0-9_.-]", "", getattr(made, "__name__", type(made).__name__).lower())
+    letters = re.sub(r"[^a-z0-9_.-]", "", getattr(factory, "__name__", type(factory).__name__).lower())
     return f"agent.{letters or 'main'}"[:32]
 
 
@@ -379,11 +379,11 @@ class AgentGroup(Agent):
         self.uncounted = _joined(member.uncounted for member in members)
         self.repeats = _joined(member.repeats for member in members)
         self._waiting: list[list[Input]] = [[] for _ in members]
-        self._held: list[tuple[int, int, Input]] = []  # time of release [ns], index of the member, input
+        self._delayed: list[tuple[int, int, Input]] = []  # time of release [ns], index of the member, input
         self._routes = RoutingTable([member.reads for member in self._members])
-        self._places: dict[str, list[tuple[int, int]]] = {}  # by key: (receiving member, hold time [ns])
+        self._destinations: dict[str, list[tuple[int, int]]] = {}  # by key: (receiving member, hold time [ns])
         self._relays = {key: [i for i, closing in enumerate(self._closing) if key in closing] for key in inner}
-        self._gate_takers = [place for place, member in enumerate(self._members) if member.takes_gates]
+        self._gate_takers = [index for index, member in enumerate(self._members) if member.takes_gates]
         readers = [() if member.takes_gates else member.reads for member in self._members]
         self._gates = GateRouter(RoutingTable(readers))
         self.takes_gates = True  # and splits them for members that do not
@@ -395,36 +395,36 @@ class AgentGroup(Agent):
             member.update_faults(info, faults)
 
     def receive(self, key: str, message: Any) -> None:
-        places = self._places.get(key)
-        if places is None:
-            places = self._places[key] = []
-            for place in self._routes.readers(key):
-                closing = self._closing[place]  # what closes one member's gate may be a plain input of another
+        destinations = self._destinations.get(key)
+        if destinations is None:
+            destinations = self._destinations[key] = []
+            for index in self._routes.readers(key):
+                closing = self._closing[index]  # what closes one member's gate may be a plain input of another
                 if key not in self._inner & closing:  # otherwise, it has been relayed
-                    held = is_held(key, closing, self._members[place].uncounted)
-                    places.append((place, self._hold_ns if held else 0))
-        for place, hold_ns in places:
+                    is_delayed = is_held(key, closing, self._members[index].uncounted)
+                    destinations.append((index, self._hold_ns if is_delayed else 0))
+        for index, hold_ns in destinations:
             if hold_ns:
-                self._held.append((message.t_ns + hold_ns, place, (key, message)))
+                self._delayed.append((message.t_ns + hold_ns, index, (key, message)))
             else:
-                self._waiting[place].append((key, message))
+                self._waiting[index].append((key, message))
 
     def receive_gate(self, gate: GateMessages) -> None:
-        for place in self._gate_takers:
-            self._waiting[place].append((keys.GATE, gate))
+        for index in self._gate_takers:
+            self._waiting[index].append((keys.GATE, gate))
         for readers, key, message in self._gates.split(gate):
-            for place in readers:
-                self._waiting[place].append((key, message))
+            for index in readers:
+                self._waiting[index].append((key, message))
 
     def step(self, t_ns: int) -> list[Output]:
-        if self._held:
-            for until_ns, place, entry in self._held:
+        if self._delayed:
+            for until_ns, index, entry in self._delayed:
                 if until_ns <= t_ns:
-                    self._waiting[place].append(entry)
-            self._held = [held for held in self._held if held[0] > t_ns]
+                    self._waiting[index].append(entry)
+            self._delayed = [delayed for delayed in self._delayed if delayed[0] > t_ns]
         outputs: list[Output] = []
-        for place, member in enumerate(self._members):
-            inputs, self._waiting[place] = self._waiting[place], []
+        for index, member in enumerate(self._members):
+            inputs, self._waiting[index] = self._waiting[index], []
             if len(inputs) > 1:
                 inputs.sort(key=canonical)
             own = member.answer(t_ns, inputs) or ()
@@ -461,8 +461,8 @@ class AgentGroup(Agent):
         if None in members:
             return None
         waiting = [[[key, encode(message)] for key, message in inputs] for inputs in self._waiting]
-        held = [[until_ns, place, key, encode(message)] for until_ns, place, (key, message) in self._held]
-        return {"members": members, "waiting": waiting, "held": held}
+        delayed = [[until_ns, index, key, encode(message)] for until_ns, index, (key, message) in self._delayed]
+        return {"members": members, "waiting": waiting, "held": delayed}
 
     def resume(self, info: Info, checkpoint: State) -> None:
         super().resume(info, checkpoint)
@@ -470,7 +470,9 @@ class AgentGroup(Agent):
         for member, its_own in zip(self._members, own["members"], strict=True):
             member.resume(info, its_own)
         self._waiting = [[(key, decode(key, payload)) for key, payload in inputs] for inputs in own["waiting"]]
-        self._held = [(until_ns, place, (key, decode(key, payload))) for until_ns, place, key, payload in own["held"]]
+        self._delayed = [
+            (until_ns, index, (key, decode(key, payload))) for until_ns, index, key, payload in own["held"]
+        ]
 
     def repeat(self, key: str, message: Any) -> None:
         next(member for member in self._members if key in member.repeats).repeat(key, message)
@@ -487,11 +489,11 @@ def _in_order(members: Sequence[Agent]) -> tuple[Agent, ...]:
     """Return the members, each after those whose outputs close its gate; raise RunError if no such order exists."""
     if not members:
         raise RunError("a group has no members; must have at least one")
-    writers = {key: place for place, member in enumerate(members) for key in member.writes}
+    writers = {key: index for index, member in enumerate(members) for key in member.writes}
     waits_for = {i: [writers[key] for key in m.gate_keys if writers.get(key, i) != i] for i, m in enumerate(members)}
     try:
-        return tuple(members[place] for place in TopologicalSorter(waits_for).static_order())
+        return tuple(members[index] for index in TopologicalSorter(waits_for).static_order())
     except CycleError as error:
-        names = ", ".join(members[place].name for place in sorted(set(error.args[1])))
-        found = f"gate_keys of a group's members {names} are outputs of each other"
-        raise RunError(f"{found}; must not wait for each other: list one of them only in `reads`") from None
+        names = ", ".join(members[index].name for index in sorted(set(error.args[1])))
+        conflict = f"gate_keys of a group's members {names} are outputs of each other"
+        raise RunError(f"{conflict}; must not wait for each other: list one of them only in `reads`") from None

@@ -65,16 +65,16 @@ class Inbox:
         self._closing = dict.fromkeys(gate_keys)
         # stamps of the last two messages by key; initially earlier than any gate
         self._sparse = dict.fromkeys(sparse, (ALWAYS_NS - 1, ALWAYS_NS - 1))
-        of_world = dict.fromkeys(key for key in gate_keys if keys.is_status(key) and key not in self._sparse)
-        self._not_of_world = {key: None for key in gate_keys if key not in of_world}  # not closed by `GateMessages`
-        self._pulse = next(iter(of_world), None)  # status whose sequence numbers reveal lost gates
+        world_keys = dict.fromkeys(key for key in gate_keys if keys.is_status(key) and key not in self._sparse)
+        self._other_keys = {key: None for key in gate_keys if key not in world_keys}  # not closed by `GateMessages`
+        self._pulse = next(iter(world_keys), None)  # status whose sequence numbers reveal lost gates
         self._waiting: dict[int, dict[tuple[str, int], Input]] = {}  # by stamp plus hold time, then by key and seq
         self._stamps: list[int] = []
         self._lacking: dict[int, dict[str, None]] = {}  # closing keys still missing, by gate
         self._gates: list[int] = []
         self._expected_from_ns: dict[str, int] = {}
         self._meters = {keys.status(drone): _Meter() for drone in counted}
-        self._came_of: dict[str, list[int] | None] = {}
+        self._arrivals: dict[str, list[int] | None] = {}
         self._beats: dict[int, int] = {}  # sequence number of the pulse, by gate
         self._last_beat: tuple[int, int] | None = None
         self.taken_ns = self._former_ns = -1  # the last two gates taken; -1 before the first
@@ -88,7 +88,7 @@ class Inbox:
         # whether the publishers of all closing keys may skip gates
         self.may_skip = len(self._sparse) == len(self._closing)
         self.duplicates = 0  # messages that arrived again before their gate was taken
-        self.late = 0  # messages that arrived after their gate was taken
+        self.late_count = 0  # messages that arrived after their gate was taken
 
     def put(self, key: str, message: Any) -> bool:
         """Store a message, or a `GateMessages` under `keys.GATE`; return False if it is a duplicate or too late."""
@@ -102,7 +102,7 @@ class Inbox:
             self._holds = self._holds or hold_ns > 0
         due_ns = t_ns + hold_ns
         if due_ns <= self.taken_ns:
-            self.late += 1
+            self.late_count += 1
             handed_ns = self._newest.get(key, ALWAYS_NS)  # if >= t_ns, this message or a newer one was delivered
             if (not self._keep_late or t_ns <= handed_ns) and key not in self._uncounted:
                 return False
@@ -117,12 +117,12 @@ class Inbox:
             self.duplicates += 1
             return False
         stamped[mark] = (key, message)
-        if key not in self._came_of:
+        if key not in self._arrivals:
             meter = self._meters.get(f"{key.rpartition('/')[0]}/status")
-            self._came_of[key] = meter.came if meter else None
-        came = self._came_of[key]
-        if came is not None:
-            _insert(came, due_ns)
+            self._arrivals[key] = meter.arrivals if meter else None
+        arrivals = self._arrivals[key]
+        if arrivals is not None:
+            _insert(arrivals, due_ns)
         if key in self._closing:
             lacking = self._lacking.get(t_ns)
             if lacking is None:
@@ -135,9 +135,9 @@ class Inbox:
                 self._meters[key].count(message)
         elif type(message) is GateMessages:  # it arrives as a unit: none of its messages can be missing
             if t_ns in self._lacking:
-                self._lacking[t_ns] = {each: None for each in self._lacking[t_ns] if each in self._not_of_world}
+                self._lacking[t_ns] = {each: None for each in self._lacking[t_ns] if each in self._other_keys}
             else:
-                self._lacking[t_ns] = self._not_of_world.copy()
+                self._lacking[t_ns] = self._other_keys.copy()
                 _insert(self._gates, t_ns)
             if self._pulse is not None:
                 self._beats[t_ns] = message.seq
@@ -167,7 +167,7 @@ class Inbox:
             if self._waits_for(key, t_ns):
                 return key
         for key, meter in self._meters.items():
-            if meter.counts and meter.short(t_ns) and t_ns >= self._expected_from_ns.get(key, ALWAYS_NS):
+            if meter.counts and meter.is_short(t_ns) and t_ns >= self._expected_from_ns.get(key, ALWAYS_NS):
                 return key
         return None
 
@@ -213,7 +213,7 @@ class Inbox:
     def take(self, t_ns: int) -> list[Input]:
         """Remove and return all inputs stamped up to t_ns, in order of (t_ns, key, seq)."""
         ready: list[Input] = []
-        for stamp in _cut(self._stamps, t_ns):
+        for stamp in _pop_until(self._stamps, t_ns):
             stamped = self._waiting.pop(stamp)
             ready += stamped.values() if len(stamped) == 1 else map(stamped.__getitem__, sorted(stamped))
         if self._holds:
@@ -223,12 +223,12 @@ class Inbox:
             self._belated.clear()
             for key, message in ready:
                 self._newest[key] = max(self._newest.get(key, ALWAYS_NS), message.t_ns)
-        for gate_ns in _cut(self._gates, t_ns):
+        for gate_ns in _pop_until(self._gates, t_ns):
             del self._lacking[gate_ns]
             if gate_ns in self._beats:
                 self._last_beat = (gate_ns, self._beats.pop(gate_ns))
         for meter in self._meters.values():
-            if meter.partial or meter.counts or meter.came:
+            if meter.partial or meter.counts or meter.arrivals:
                 meter.forget(t_ns)
         self._former_ns, self.taken_ns = self.taken_ns, t_ns
         return _once(ready) if len(ready) > 1 else ready
@@ -243,7 +243,7 @@ def _once(ready: list[Input]) -> list[Input]:
     gates = [message for _, message in ready if type(message) is GateMessages]
     if not gates or not any(keys.is_sensor(key) for key, _ in ready):
         return ready
-    covered = {gate.table[place] for gate in gates for place in set(gate.which.tolist()) if place < len(gate.table)}
+    covered = {gate.table[index] for gate in gates for index in set(gate.which.tolist()) if index < len(gate.table)}
     return [(key, message) for key, message in ready if key not in covered]
 
 
@@ -255,8 +255,8 @@ class _Meter:
     """
 
     def __init__(self) -> None:
-        self.came: list[int] = []  # stamps of the drone's pending sensor messages, sorted
-        # stamps and counts of the drone's pending statuses; if empty, `short` is false
+        self.arrivals: list[int] = []  # stamps of the drone's pending sensor messages, sorted
+        # stamps and counts of the drone's pending statuses; if empty, `is_short` is false
         self.counts: list[tuple[int, int]] = []
         self.partial = True  # whether the first status may count messages from before the join
 
@@ -265,14 +265,14 @@ class _Meter:
         if status.seq == 0:
             self.partial = False
 
-    def short(self, t_ns: int) -> bool:
+    def is_short(self, t_ns: int) -> bool:
         """Whether sensor messages of the gates up to t_ns are missing."""
         if self.partial:
             return False
-        return bisect_right(self.came, t_ns) < sum(count for gate_ns, count in self.counts if gate_ns <= t_ns)
+        return bisect_right(self.arrivals, t_ns) < sum(count for gate_ns, count in self.counts if gate_ns <= t_ns)
 
     def forget(self, t_ns: int) -> None:
-        _cut(self.came, t_ns)
+        _pop_until(self.arrivals, t_ns)
         self.counts = [counted for counted in self.counts if counted[0] > t_ns]
         self.partial = False
 
@@ -285,12 +285,12 @@ def _insert(stamps: list[int], t_ns: int) -> None:
         insort(stamps, t_ns)
 
 
-def _cut(stamps: list[int], t_ns: int) -> list[int]:
+def _pop_until(stamps: list[int], t_ns: int) -> list[int]:
     """Remove the stamps up to t_ns from a sorted list and return them."""
-    place = bisect_right(stamps, t_ns)
-    taken = stamps[:place]
-    del stamps[:place]
-    return taken
+    index = bisect_right(stamps, t_ns)
+    removed = stamps[:index]
+    del stamps[:index]
+    return removed
 
 
 class RoutingTable:
@@ -311,7 +311,7 @@ class RoutingTable:
         self._filed: defaultdict[str, list[int]] = defaultdict(list)  # readers by expression with no wildcard but *
         self._starred: defaultdict[int, set[tuple[int, ...]]] = defaultdict(set)  # positions of *, by number of chunks
         self._compared: list[tuple[str, int]] = []
-        self._known: dict[str, tuple[int, ...]] = {}
+        self._cache: dict[str, tuple[int, ...]] = {}
         for reader, own in enumerate(expressions):
             for expression in own:
                 chunks = expression.split("/")
@@ -320,27 +320,27 @@ class RoutingTable:
                     continue
                 self._filed[expression].append(reader)
                 if "*" in chunks:
-                    starred = tuple(place for place, chunk in enumerate(chunks) if chunk == "*")
+                    starred = tuple(index for index, chunk in enumerate(chunks) if chunk == "*")
                     self._starred[len(chunks)].add(starred)
 
     def readers(self, key: str) -> tuple[int, ...]:
-        known = self._known.get(key)
-        if known is not None:
-            return known
-        found = set(self._filed.get(key, ()))
+        cached = self._cache.get(key)
+        if cached is not None:
+            return cached
+        matches = set(self._filed.get(key, ()))
         chunks = key.split("/")
         for starred in self._starred.get(len(chunks), ()):
-            if not any(chunks[place].startswith("@") for place in starred):  # no wildcard matches such a chunk
-                masked = ["*" if place in starred else chunk for place, chunk in enumerate(chunks)]
-                found.update(self._filed.get("/".join(masked), ()))
-        found.update(reader for expression, reader in self._compared if keys.matches(expression, key))
-        readers = tuple(sorted(found))
-        if len(self._known) < KEYS_MAX:
-            self._known[key] = readers
+            if not any(chunks[index].startswith("@") for index in starred):  # no wildcard matches such a chunk
+                masked = ["*" if index in starred else chunk for index, chunk in enumerate(chunks)]
+                matches.update(self._filed.get("/".join(masked), ()))
+        matches.update(reader for expression, reader in self._compared if keys.matches(expression, key))
+        readers = tuple(sorted(matches))
+        if len(self._cache) < KEYS_MAX:
+            self._cache[key] = readers
         return readers
 
-    def readers_of_any(self, of: Iterable[str]) -> tuple[int, ...]:
-        return tuple(sorted({reader for key in of for reader in self.readers(key)}))
+    def readers_of_any(self, topic_keys: Iterable[str]) -> tuple[int, ...]:
+        return tuple(sorted({reader for key in topic_keys for reader in self.readers(key)}))
 
 
 class GateRouter:
@@ -352,20 +352,20 @@ class GateRouter:
 
     def _read_of(self, gate: GateMessages) -> list[tuple[tuple[int, ...], str, int]]:
         """Return the readers, the key and the index in the gate of each message that has readers."""
-        which, readers_of = gate.which.tolist(), self._routes.readers
-        if not which or min(which) < 0 or max(which) >= len(gate.table):
+        indices, readers_of = gate.which.tolist(), self._routes.readers
+        if not indices or min(indices) < 0 or max(indices) >= len(gate.table):
             return []
-        keys_of = map(gate.table.__getitem__, which)
-        return [(readers, key, place) for place, key in enumerate(keys_of) if (readers := readers_of(key))]
+        keys_of = map(gate.table.__getitem__, indices)
+        return [(readers, key, index) for index, key in enumerate(keys_of) if (readers := readers_of(key))]
 
     def split(self, gate: GateMessages) -> Iterator[tuple[tuple[int, ...], str, Any]]:
         """Yield (readers, key, message) for each message that has readers, in order of publication.
 
         Messages that are not of their key's type are omitted, as are gates whose columns point outside their table.
         """
-        for readers, key, place in self._read.of(gate):
+        for readers, key, index in self._read.of(gate):
             try:
-                message = messages.decode(key, gate.payload(place))
+                message = messages.decode(key, gate.payload(index))
             except DecodeError:
                 continue  # not written by the world: treated as lost
             yield readers, key, message

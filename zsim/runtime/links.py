@@ -107,27 +107,27 @@ class Links:
         over_radio_ns = self._radio.delay_ns(key, message) if self._radio and isinstance(message, AgentMessage) else 0
         if over_radio_ns is None:
             return None
-        froms, (kind, thing, _) = senders(key, message, self._roles), keys.parts(key)
+        sources, (kind, thing, _) = senders(key, message, self._roles), keys.parts(key)
         to = stock if keys.is_sensor(key) and (stock := f"estimator.{thing}") in self._names else self._names[0]
 
         aboard = drone_of(to, self._drones)
 
         def acts(fault: Fault) -> bool:
             if fault.kind != RADIO:
-                return joins(fault, froms, to)
+                return joins(fault, sources, to)
             drones = self._clusters.get(fault.target)
             return kind == "drone" and aboard != thing and (drones is None or thing in drones)
 
         def distance_m(fault: Fault) -> float | None:
-            place = place_of(to, fault.parameters["place"], self._drones, self._positions.get)
-            return distance_between(self._positions.get(thing), place)
+            position_m = position_of(to, fault.parameters["place"], self._drones, self._positions.get)
+            return distance_between(self._positions.get(thing), position_m)
 
-        of_faults_ns = total_delay_ns(filter(acts, acting), self._seed, to, key, message, distance_m)
-        return None if of_faults_ns is None else over_radio_ns + of_faults_ns
+        fault_delay_ns = total_delay_ns(filter(acts, acting), self._seed, to, key, message, distance_m)
+        return None if fault_delay_ns is None else over_radio_ns + fault_delay_ns
 
     def snapshot(self) -> State:
         later = [[gate_ns, key, messages.encode(message)] for gate_ns, key, message in self._later]
-        positions = {drone: list(place) for drone, place in self._positions.items()}
+        positions = {drone: list(position) for drone, position in self._positions.items()}
         return {
             "later": later,
             "positions": positions,
@@ -187,15 +187,15 @@ def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
     return first == to and second in froms and not fault.parameters["one_way"]
 
 
-def place_of(
-    process: str, places: Mapping[str, Any], drones: Container[str], where: Callable[[str], Point | None]
+def position_of(
+    process: str, places: Mapping[str, Any], drones: Container[str], lookup: Callable[[str], Point | None]
 ) -> Point | None:
     """Return the position of a process [m; W]: that in `places`, otherwise that of its drone, otherwise the origin.
 
-    `where` returns the position of a drone [m; W], None if unknown.
+    `lookup` returns the position of a drone [m; W], None if unknown.
     """
-    place = places.get(process, drone_of(process, drones) or fault_kinds.ORIGIN)
-    return where(place) if isinstance(place, str) else place
+    position = places.get(process, drone_of(process, drones) or fault_kinds.ORIGIN)
+    return lookup(position) if isinstance(position, str) else position
 
 
 def distance_between(a: Point | None, b: Point | None) -> float | None:
@@ -219,20 +219,20 @@ def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str,
     """
     if role := roles.get(messages.shape_of(key)):
         return (f"{role}.{keys.thing(key)}",)
-    kind, whose, what = keys.parts(key)
+    kind, owner, topic = keys.parts(key)
     source = getattr(message, "source", "")
-    if kind == "drone" and what.startswith("cmd/"):
+    if kind == "drone" and topic.startswith("cmd/"):
         return (source,)
-    if kind == "drone" and what == "estimate":
-        named = f"estimator.{whose}"
-    elif kind == "drone" and what in ("reference", "request"):
-        named = f"reference.{whose}"
+    if kind == "drone" and topic == "estimate":
+        implied = f"estimator.{owner}"
+    elif kind == "drone" and topic in ("reference", "request"):
+        implied = f"reference.{owner}"
     elif kind == "cluster":
-        named = f"controller.{whose}"
+        implied = f"controller.{owner}"
     else:
-        return (whose,) if kind == "process" else (WORLD,)
+        return (owner,) if kind == "process" else (WORLD,)
     is_shared = source.partition(".")[0] in ("estimator", "controller", "reference")
-    return (named,) if is_shared or not source else (named, source)  # `source` may have replaced the agent
+    return (implied,) if is_shared or not source else (implied, source)  # `source` may have replaced the agent
 
 
 class Receiver:
@@ -244,26 +244,26 @@ class Receiver:
 
     def __init__(self, info: Info, radio: Radio, process: str) -> None:
         self._seed, self._radio, self._process = info.seed, radio, process
-        self._places = {drone.name: place for place, drone in enumerate(info.drones)}
-        self._place = self._place_of(process.partition(".")[2])
+        self._indices = {drone.name: index for index, drone in enumerate(info.drones)}
+        self._index = self._index_of(process.partition(".")[2])
         self._lists: deque[RadioLinks] = deque(maxlen=LISTS_KEPT)
 
-    def _place_of(self, thing: str) -> int | None:
+    def _index_of(self, thing: str) -> int | None:
         """Return the index of a drone or of the ground station; None if the agent is wired to all others."""
-        station = None if self._radio.station_m is None else len(self._places)
-        return self._places.get(thing, station)
+        station = None if self._radio.station_m is None else len(self._indices)
+        return self._indices.get(thing, station)
 
     def take(self, links: RadioLinks) -> None:
         self._lists.append(links)
 
     def delay_ns(self, key: str, message: AgentMessage) -> int | None:
         """Return the delay of a message [ns]; NEVER if it is lost."""
-        sender, radio = self._place_of(keys.thing(key)), self._radio
-        if sender == self._place or sender is None or self._place is None:
+        sender, radio = self._index_of(keys.thing(key)), self._radio
+        if sender == self._index or sender is None or self._index is None:
             return 0
         links = next((each for each in reversed(self._lists) if each.t_ns <= message.t_ns), None)
         draw = (self._seed, self._process, key, message.t_ns, message.seq)
-        if links is None or uniform("radio", *draw) >= (1.0 - radio.loss) * _reception(links, self._place, sender):
+        if links is None or uniform("radio", *draw) >= (1.0 - radio.loss) * _reception(links, self._index, sender):
             return NEVER
         delay_ms = radio.delay_ms + (radio.jitter_ms * uniform("radio_jitter", *draw) if radio.jitter_ms else 0.0)
         return math.ceil(delay_ms * 1e6)
@@ -282,8 +282,8 @@ def _reception(links: RadioLinks, receiver: int, sender: int) -> float:
     if sender not in hears:
         return 0.0
     chances = links.reception[receiver] if receiver < len(links.reception) else ()
-    place = hears.index(sender)
-    return chances[place] if place < len(chances) else 1.0
+    index = hears.index(sender)
+    return chances[index] if index < len(chances) else 1.0
 
 
 class Transmitter:

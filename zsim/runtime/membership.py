@@ -84,7 +84,7 @@ class HealthMeter:
         self._host = host or socket.gethostname()
         self._reads = reads
         self._steps_us: deque[float] = deque(maxlen=STEPS_KEPT)
-        self._limit = RateLimit(PERIOD_S, now=wall_s)
+        self._limit = RateLimit(PERIOD_S, clock=wall_s)
         self._limit.spend()  # so that the first message is due after one period
         self.received = self.refused = self.dropped = 0
         self.lag_ns = 0  # lead of the newest gate over the last one handled

@@ -33,7 +33,7 @@ ANOTHER_RUN = "the world has begun another run"
 REPLAY_S = 2.0  # wall-time limit of a replay; a hub answers within milliseconds, or never if the link is lost
 REJOINS_MAX = 6  # unanswered joins after which one is assumed to have arrived; a new router forwards nothing at first
 RETRY_S = 0.5  # wall time between attempts at an unanswered request to the world
-ASKED_MAX = 10  # maximum replays for a lost message, which may still be on its way to the world at the first
+REQUESTS_MAX = 10  # maximum replays for a lost message, which may still be on its way to the world at the first
 RESUME_NS = 4_000_000_000  # maximum simulated age of a usable snapshot: the world keeps 5 s of history
 GATES_KEPT = 2  # gates whose outputs are kept for queries, as the contract demands; more if the world runs ahead
 
@@ -106,8 +106,8 @@ class Participant:
         self._link.declare_process(self.name)
         self.join()
 
-    def join(self, again: bool = False) -> None:
-        if again:
+    def join(self, is_rejoin: bool = False) -> None:
+        if is_rejoin:
             self._renew_incarnation()
         self.publish("join", self._membership.join(self.now_ns))
 
@@ -127,7 +127,7 @@ class Participant:
         """Rejoin if necessary, and publish health once per wall second; call this more often than that."""
         if self.must_rejoin:
             self.must_rejoin = False
-            self.join(again=True)
+            self.join(is_rejoin=True)
             if self.done_ns >= 0:  # the last done may have been lost, or belong to the former incarnation
                 self.done(self.done_ns)
         self.publish_health()
@@ -214,13 +214,13 @@ class AgentParticipant(Participant):
         self._stopped = stopped
         self._done_key = keys.process(agent.name, "done")
         ahead = info.command_delay_ns // info.gate_ns
-        self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
+        self._recent_outputs: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
         self._unsent: Pairs = []
         self._resumed = False
         self._unproved = 0  # joins left to repeat, unless the world proves that it goes on with this process …
         self._proof_ns = 0  # … beyond this gate
         self._missed_since_ns: int | None = None
-        self._asked_ns, self._asked = -1, 0
+        self._requested_ns, self._request_count = -1, 0
         self._retry_s = 0.0
         # gate up to which the predecessor published all outputs; they are not published again
         self.published_ns = -1
@@ -235,19 +235,19 @@ class AgentParticipant(Participant):
         The world's history must reach back to the snapshot: later messages are fetched and processed again.
         """
         for sample in self._last_values(keys.process(self.name, "snapshot")):
-            fresh = self._agent.checkpoint()
+            initial_state = self._agent.checkpoint()
             try:
                 snapshot: run_messages.Snapshot = messages.decode(sample.key, sample.payload)
                 clocks = [messages.decode(each.key, each.payload) for each in self._last_values(keys.CLOCK)]
                 age_ns = (clocks[0].t_ns if clocks else 0) - snapshot.t_ns
                 if not 0 <= age_ns <= RESUME_NS or snapshot.version != VERSION:
-                    found = f"it is of version {snapshot.version}, and {age_ns / 1e9:.2f} s old"
-                    raise DecodeError(f"{found}; must be of version {VERSION}, and 0 to {RESUME_NS / 1e9:g} s old")
+                    problem = f"it is of version {snapshot.version}, and {age_ns / 1e9:.2f} s old"
+                    raise DecodeError(f"{problem}; must be of version {VERSION}, and 0 to {RESUME_NS / 1e9:g} s old")
                 self._agent.resume(self._info, unpack(snapshot.state))
             except Exception as error:  # any program may have written it, and a user's class reads it
                 self._say(f"{self.name}: its last snapshot is unusable: {error or type(error).__name__}")
-                if fresh is not None:
-                    self._agent.resume(self._info, fresh)  # the unusable state may be half restored
+                if initial_state is not None:
+                    self._agent.resume(self._info, initial_state)  # the unusable state may be half restored
                 continue
             self._say(f"{self.name}: continues from its snapshot of t = {snapshot.t_ns / 1e9:.2f} s")
             self.done_ns = self.now_ns = snapshot.t_ns
@@ -278,13 +278,13 @@ class AgentParticipant(Participant):
         A world that has died is restarted; an agent that did not wait for it would lose its former state.
         """
         while not self._stopped():
-            found = self._link.get_surely(key)
-            if not found and self._link.get_surely(keys.INFO):  # a world answers, but may have appeared only just now
-                found = self._link.get_surely(key)
-                if found is not None:
-                    return found
-            if found:
-                return found
+            values = self._link.get_surely(key)
+            if not values and self._link.get_surely(keys.INFO):  # a world answers, but may have appeared only just now
+                values = self._link.get_surely(key)
+                if values is not None:
+                    return values
+            if values:
+                return values
             time.sleep(RETRY_S)
         return []
 
@@ -293,8 +293,8 @@ class AgentParticipant(Participant):
         if t_ns > snapshot_ns + self._info.gate_ns:
             self._fail_behind(f"the gates after its snapshot of t = {snapshot_ns / 1e9:.2f} s are")
 
-    def _fail_behind(self, what: str) -> None:
-        self.failure = BehindError(f"{self.name}: {what} no longer kept; this process ends; start it again")
+    def _fail_behind(self, cause: str) -> None:
+        self.failure = BehindError(f"{self.name}: {cause} no longer kept; this process ends; start it again")
 
     # Taking part
 
@@ -306,7 +306,7 @@ class AgentParticipant(Participant):
 
     def publish_gate(self, t_ns: int, outputs: Sequence[Output]) -> None:
         """Queue the outputs of a gate and the done that counts them for `send`."""
-        self._kept.append((t_ns, outputs))
+        self._recent_outputs.append((t_ns, outputs))
         self.now_ns = self.done_ns = max(self.done_ns, t_ns)
         done = self._membership.done(t_ns, _counted(outputs))
         if t_ns <= self.published_ns:
@@ -334,7 +334,7 @@ class AgentParticipant(Participant):
 
     def outputs(self) -> list[list[object]]:
         """Return the outputs of the last gates as [key, payload] pairs, for a world that lost them."""
-        return [[key, messages.encode(message)] for _, outputs in self._kept for key, message in outputs]
+        return [[key, messages.encode(message)] for _, outputs in self._recent_outputs for key, message in outputs]
 
     def take_entry(self, entry: ProcessEntry) -> None:
         """Handle an admission; if it is that of this process, fetch the messages since the restored state."""
@@ -374,10 +374,10 @@ class AgentParticipant(Participant):
 
     def ask_again(self, t_ns: int, missing: str) -> None:
         """Fetch the missing messages of a gate, for example after the link was cut."""
-        if t_ns != self._asked_ns:
-            self._asked_ns, self._asked, self._retry_s = t_ns, 0, 0.0
+        if t_ns != self._requested_ns:
+            self._requested_ns, self._request_count, self._retry_s = t_ns, 0, 0.0
             self._say(f"{self.name}: {missing} of t = {t_ns / 1e9:.2f} s did not arrive; requesting it again")
-        if self._asked >= ASKED_MAX:
+        if self._request_count >= REQUESTS_MAX:
             self._fail_behind(f"{missing} of t = {t_ns / 1e9:.2f} s is")
             return
         self._missed_since_ns = t_ns - self._info.gate_ns
@@ -424,7 +424,7 @@ class AgentParticipant(Participant):
     def _publish_again(self) -> None:
         """Join, and repeat the outputs and done messages that may have been lost."""
         self.join()
-        for t_ns, outputs in self._kept:
+        for t_ns, outputs in self._recent_outputs:
             for key, message in outputs:
                 self._link.put(key, message)
             self._link.put(self._done_key, self._membership.done(t_ns, _counted(outputs)))
@@ -437,14 +437,14 @@ class AgentParticipant(Participant):
     def _fetch(self, since_ns: int) -> None:
         self.ask_faults()
         try:
-            wanted = (*self._agent.reads, *self._agent.repeats, keys.FAULTS)
+            expressions = (*self._agent.reads, *self._agent.repeats, keys.FAULTS)
             held_ns = output_hold_ns(self._info) if self._agent.overhears else 0
-            for key, payload in replay(self._link, self.name, max(-1, since_ns - held_ns), wanted, REPLAY_S):
+            for key, payload in replay(self._link, self.name, max(-1, since_ns - held_ns), expressions, REPLAY_S):
                 self._take_in(ReceivedSample(key, payload))
         except NoWorldError:
             return
         self._missed_since_ns = None
-        self._asked += 1
+        self._request_count += 1
 
 
 def _counted(outputs: Sequence[Output]) -> int:

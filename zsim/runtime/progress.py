@@ -14,14 +14,14 @@ from rich.text import Text
 
 from zsim.contract.flight_messages import ClusterState
 from zsim.contract.run_messages import Waiting, waiting_text
-from zsim.errors import printable, without_figures
+from zsim.errors import printable, without_numbers
 
 PERIOD_S = 0.2  # wall time between two updates
 SLOW_S = 3.0  # wall time until the notice; compiled code loads within 2 s unless the machine is busy
 SLOW_NOTICE = "loading compiled code; the first time on a machine it is compiled, which takes one to three minutes"
 REPEATED_S = 10.0  # simulated time over which equal events are counted; also the interval of plain clock lines
 REASON_NS = 5_000_000_000  # simulated time after which a reason is shown; in a normal take-off one lasts 3 s
-DRIVERS, COMINGS = "driver.", ("join", "leave")  # shown because people start drivers by hand and watch this screen
+DRIVERS, PRESENCE = "driver.", ("join", "leave")  # shown because people start drivers by hand and watch this screen
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
 
 
@@ -76,7 +76,7 @@ class HoldReasons:
 
     def line(self, cluster: str, state: ClusterState) -> str | None:
         """Return a line once a state's reason, whatever its numbers, has persisted for REASON_NS; otherwise None."""
-        shape = without_figures(state.reason)
+        shape = without_numbers(state.reason)
         former, since_ns = self._since.get(cluster, ("", 0))
         if shape != former:
             self._since[cluster] = (shape, state.t_ns)
@@ -209,7 +209,7 @@ class Screen:
             self.say(text)
 
     def event(self, line: dict[str, Any]) -> None:
-        is_coming = line["kind"] in COMINGS and line["text"].startswith(DRIVERS)
+        is_coming = line["kind"] in PRESENCE and line["text"].startswith(DRIVERS)
         if line["kind"] not in QUIET or is_coming or line.get("data", {}).get("fails"):
             for text in self._repeated.lines(line["t_s"], line["kind"], line["text"]):
                 self.say(text)

@@ -15,13 +15,13 @@ class RateLimit:
     Args:
         period: interval at which a token is added, in the clock's unit.
         burst: capacity of a bucket, in tokens.
-        now: the clock; by default monotonic wall time [s].
+        clock: the clock; by default monotonic wall time [s].
     """
 
-    def __init__(self, period: float, burst: float = 1, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, period: float, burst: float = 1, clock: Callable[[], float] = time.monotonic) -> None:
         self.period = period
         self._burst = burst
-        self._now = now
+        self._clock = clock
         self._spent: dict[str, tuple[float, float]] = {}  # by subject: tokens spent, and when the last was
 
     def knows(self, subject: str) -> bool:
@@ -32,7 +32,7 @@ class RateLimit:
 
     def spend(self, subject: str = "") -> bool:
         """Spend a token; return False if none is left."""
-        now = self._now()  # inlines `_counted` for speed: some callers spend a token at each gate
+        now = self._clock()  # inlines `_counted` for speed: some callers spend a token at each gate
         spent, at = self._spent.get(subject, (0.0, 0))
         counted = max(0.0, spent - (now - at) / self.period)
         if counted > self._burst - 1:
@@ -48,4 +48,4 @@ class RateLimit:
 
     def _counted(self, subject: str) -> float:
         spent, at = self._spent.get(subject, (0.0, 0))
-        return max(0.0, spent - (self._now() - at) / self.period)
+        return max(0.0, spent - (self._clock() - at) / self.period)

@@ -69,7 +69,7 @@ class Runner:
         self._end_ns: int | None = None
         self._end_wall_s = 0.0
         self._leave: str | None = None
-        self._over = threading.Event()
+        self._end_event = threading.Event()
         self.killed = False  # whether a fault ended it without a bye; its process must then die too
 
     def run(self) -> str:
@@ -104,7 +104,7 @@ class Runner:
             self._member.leave(str(failure), failed=True)
             raise failure from error
         finally:
-            self._over.set()
+            self._end_event.set()
             ticker.join()
         if self._member.failure:
             raise self._member.failure
@@ -124,8 +124,8 @@ class Runner:
         if self._leave is None and self._stopped():
             self._leave = "stopped"
         elif self._leave is None and self._end_ns is not None:
-            late = time.monotonic() - self._end_wall_s > DRAIN_S
-            if self._member.done_ns >= self._end_ns // self._agent.period_ns * self._agent.period_ns or late:
+            is_overdue = time.monotonic() - self._end_wall_s > DRAIN_S
+            if self._member.done_ns >= self._end_ns // self._agent.period_ns * self._agent.period_ns or is_overdue:
                 self._leave = run_messages.RUN_ENDED
         if self._leave is None and not stepped:
             try:
@@ -201,15 +201,15 @@ class Runner:
         if faults.seq > self._list_seq:
             self._list_seq = faults.seq
             kills = self._kills.values()
-            begun = {f.id: f for f in kills if f.until_ns is not None and f.until_ns <= faults.t_ns}
+            started = {f.id: f for f in kills if f.until_ns is not None and f.until_ns <= faults.t_ns}
             names = self._agent.name, *self._agent.serves
             listed = {f.id: f for f in faults.faults if f.kind == PROCESS_KILL and f.target in names}
-            self._kills = begun | listed
+            self._kills = started | listed
 
     # Rare inputs
 
     def _tick(self) -> None:
-        while not self._over.wait(TICK_S):
+        while not self._end_event.wait(TICK_S):
             if self._stopped() or self._end_ns is not None or self._lacks or self._member.owes:
                 self._inputs.wake()
             self._member.publish_health()
@@ -268,9 +268,9 @@ class RunnerInputs:
         self._is_realtime, self._gate_ns = info.mode == "realtime", info.gate_ns
         self._blocking: Subscription | None = None  # subscription on which `wait` blocks
         self._external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
-        of_drivers = [key for key in agent.gate_keys if keys.parts(key)[1] in self._external]
+        driver_keys = [key for key in agent.gate_keys if keys.parts(key)[1] in self._external]
         self.inbox = Inbox(
-            agent.gate_keys, agent.counted, self._is_realtime, agent.uncounted, of_drivers, output_hold_ns(info)
+            agent.gate_keys, agent.counted, self._is_realtime, agent.uncounted, driver_keys, output_hold_ns(info)
         )
         estimates = (key for key in agent.gate_keys if key.endswith("/estimate"))
         self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
@@ -279,22 +279,22 @@ class RunnerInputs:
         self._expressions = RoutingTable([[expression] for expression in agent.reads])
         self._table = run_key_table(info)
         # key of a gate's sensor messages as `GateMessages`; drivers publish those of external drones singly
-        of_world = [drone for drone in agent.counted if drone not in self._external]
+        world_drones = [drone for drone in agent.counted if drone not in self._external]
         self._gate_key = ""
-        if of_world and len(agent.counted) > 1:
+        if world_drones and len(agent.counted) > 1:
             self._gate_key = keys.GATE
-        elif of_world and agent.takes_gates:
-            self._gate_key = keys.gate(of_world[0])
+        elif world_drones and agent.takes_gates:
+            self._gate_key = keys.gate(world_drones[0])
         self.rare: deque[WorldEvent | Query | bool] = deque()  # in order of arrival; a bool says whether the link is up
         self._fault_lists: deque[run_messages.Faults] = deque()
         self._repeated: dict[int, dict[tuple[str, int], Any]] = {}  # by gate, then by key and seq
 
     def subscribe(self) -> None:
         """Subscribe to the agent's keys; declare its request keys and liveliness token."""
-        closing = [self._agent.reads[place] for place in self._expressions.readers_of_any(self._agent.gate_keys)]
+        closing = [self._agent.reads[index] for index in self._expressions.readers_of_any(self._agent.gate_keys)]
         for expression in dict.fromkeys([*closing, *self._agent.reads]):
-            of_world = keys.is_sensor(expression) and keys.thing(expression) not in self._external
-            subscribed = self._gate_key if self._gate_key and of_world else expression
+            is_world_sensor = keys.is_sensor(expression) and keys.thing(expression) not in self._external
+            subscribed = self._gate_key if self._gate_key and is_world_sensor else expression
             if subscribed not in self._subscriptions:
                 self._subscriptions[subscribed] = self._link.subscribe(subscribed)
         self._link.declare_subscriber(keys.EVENT, self._on_event)
@@ -308,8 +308,8 @@ class RunnerInputs:
 
     def wait(self) -> None:
         """Wait for a message that may complete the next gate, or until woken; SessionError if the session is closed."""
-        wanted = self.inbox.last_missing() or self._agent.gate_keys[-1]
-        expression = self._agent.reads[self._expressions.readers(wanted)[0]]
+        awaited_key = self.inbox.last_missing() or self._agent.gate_keys[-1]
+        expression = self._agent.reads[self._expressions.readers(awaited_key)[0]]
         self._blocking = self._subscriptions[expression if expression in self._subscriptions else self._gate_key]
         sample = self._blocking.receive()
         self._blocking = None

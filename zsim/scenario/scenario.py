@@ -593,9 +593,9 @@ class Scenario(Spec, frozen=True, kw_only=True):
     def piloted(self) -> dict[str, DroneReference | Exchange]:
         """Return the references and exchanges that drones outside clusters fly, by drone in the scenario's order."""
         exchanges = [] if self.exchanges is UNSET else self.exchanges
-        found: dict[str, DroneReference | Exchange] = {name: each for each in exchanges for name in each.drones}
-        found |= {drone.name: drone.reference for drone in self.drones if drone.reference is not UNSET}
-        return {drone.name: found[drone.name] for drone in self.drones if drone.name in found}
+        plans: dict[str, DroneReference | Exchange] = {name: each for each in exchanges for name in each.drones}
+        plans |= {drone.name: drone.reference for drone in self.drones if drone.reference is not UNSET}
+        return {drone.name: plans[drone.name] for drone in self.drones if drone.name in plans}
 
     @property
     def own_agents(self) -> dict[str, OwnAgent]:
@@ -638,7 +638,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
 
 
 _SECTIONS = ("limits", "aerodynamics")
-_OWN = (
+_OWN_FIELDS = (
     "name",
     "body",
     "position_m",
@@ -646,7 +646,7 @@ _OWN = (
     "reference",
     "sensors",
 )  # fields of a drone that its vehicle does not define
-_SHARED = {name: kind for name, kind in get_type_hints(Drone, include_extras=True).items() if name not in _OWN}
+_SHARED = {name: kind for name, kind in get_type_hints(Drone, include_extras=True).items() if name not in _OWN_FIELDS}
 SharedVehicle: Any = defstruct(
     "SharedVehicle",
     [(name, kind | UnsetType, UNSET) for name, kind in _SHARED.items()],

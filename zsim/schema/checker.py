@@ -39,10 +39,10 @@ def first_fault(value: Any, description: Any) -> Fault | None:
 
 def first_lines(lines: Iterable[str]) -> list[str]:
     """Return the first FAULTS_MAX lines, followed by a line with the number of further ones."""
-    rest = iter(lines)
-    first = list(islice(rest, FAULTS_MAX))
-    more = sum(1 for _ in islice(rest, COUNTED_MAX))
-    return [*first, f"… and {'at least ' if more == COUNTED_MAX else ''}{more} more faults"] if more else first
+    remaining = iter(lines)
+    first = list(islice(remaining, FAULTS_MAX))
+    further = sum(1 for _ in islice(remaining, COUNTED_MAX))
+    return [*first, f"… and {'at least ' if further == COUNTED_MAX else ''}{further} more faults"] if further else first
 
 
 def sound(value: Any, description: Any) -> Any:
@@ -106,11 +106,11 @@ def _check_many(value: Any, info: types.ListType | types.VarTupleType | types.Di
     if not isinstance(value, dict if is_map else list | tuple):
         yield path, f"is {show(value)}; must be a {'map' if is_map else 'list'}"
         return
-    least, most = info.min_length or 0, info.max_length
-    if len(value) < least or (most is not None and len(value) > most):
-        length = f"at least {least}" if most is None else f"{most}" if least == most else f"{least} to {most}"
+    low, high = info.min_length or 0, info.max_length
+    if len(value) < low or (high is not None and len(value) > high):
+        length = f"at least {low}" if high is None else f"{high}" if low == high else f"{low} to {high}"
         yield path, f"has {len(value)} entries; must have {length}"
-    if len(value) > (most or len(value)):
+    if len(value) > (high or len(value)):
         return
     if isinstance(info, types.DictType):
         for key, item in cast("dict[Any, Any]", value).items():
@@ -125,8 +125,8 @@ def _check_many(value: Any, info: types.ListType | types.VarTupleType | types.Di
 def _scalar_fault(value: Any, info: types.Type) -> str | None:
     allowed: str | None = None
     if isinstance(info, types.FloatType | types.IntType):
-        whole = isinstance(info, types.IntType)
-        is_number = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+        is_integer = isinstance(info, types.IntType)
+        is_number = isinstance(value, int if is_integer else int | float) and not isinstance(value, bool)
         if not is_number or (isinstance(value, float) and not math.isfinite(value)):
             allowed = _expected(info)
         elif not (
@@ -135,8 +135,8 @@ def _scalar_fault(value: Any, info: types.Type) -> str | None:
             and (info.lt is None or value < info.lt)
             and (info.le is None or value <= info.le)
         ):
-            wide = whole and not -(2**63) <= value < 2**63
-            allowed = "a signed 64-bit whole number" if wide else _limits(info)
+            is_too_wide = is_integer and not -(2**63) <= value < 2**63
+            allowed = "a signed 64-bit whole number" if is_too_wide else _limits(info)
     elif isinstance(info, types.LiteralType):
         allowed = _expected(info) if value not in info.values else None
     elif isinstance(info, types.BoolType | types.BytesType | types.StrType):
@@ -158,7 +158,7 @@ def _expected(info: types.Type) -> str:
         return f"a list of {len(info.item_types)} entries"
     if isinstance(info, types.LiteralType):
         return f"one of {', '.join(str(option) for option in info.values)}"
-    words = {
+    phrases = {
         types.StrType: "text",
         types.BytesType: "bytes",
         types.BoolType: "true or false",
@@ -167,7 +167,7 @@ def _expected(info: types.Type) -> str:
         types.StructType: "a map",
         types.DictType: "a map",
     }
-    return words.get(type(info), "given")
+    return phrases.get(type(info), "given")
 
 
 def _limits(info: types.FloatType | types.IntType) -> str:

@@ -32,7 +32,7 @@ else:
 """Type of a field: a finite number, a whole number, a flag, text, or a list of numbers of any or a fixed length."""
 FieldName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}\Z")]
 MessageName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}\Z")]
-_WORDS = {types.FloatType: "number", types.IntType: "whole", types.BoolType: "flag", types.StrType: "text"}
+_TYPE_NAMES = {types.FloatType: "number", types.IntType: "whole", types.BoolType: "flag", types.StrType: "text"}
 _TYPES: dict[str, Any] = {
     "number": Number,
     "whole": Whole,
@@ -62,21 +62,21 @@ def field_types(message: type[Struct], base: type[Struct], but: Collection[str] 
         TypeError: a field has a type not allowed in users' messages.
     """
     info: Any = types.type_info(message)
-    words: dict[str, Any] = {}
+    type_names: dict[str, Any] = {}
     for field in info.fields:
         if field.name in base.__struct_fields__:
             continue
-        word = _word(field.type)
-        if word is None or word in but:
+        type_name = _type_name(field.type)
+        if type_name is None or type_name in but:
             words_allowed = ("number", "tuple or list of numbers", "whole number", "bool", "text")
             allowed = ", ".join(each for each in words_allowed if each not in but)
-            found = getattr(message, "__annotations__", {}).get(field.name, "another type")
-            raise TypeError(f"{message.__name__}.{field.name} is {found!s:.60}; must be a {allowed}")
-        words[field.name] = word
-    return words
+            annotation = getattr(message, "__annotations__", {}).get(field.name, "another type")
+            raise TypeError(f"{message.__name__}.{field.name} is {annotation!s:.60}; must be a {allowed}")
+        type_names[field.name] = type_name
+    return type_names
 
 
-def _word(kind: Any) -> FieldType | None:
+def _type_name(kind: Any) -> FieldType | None:
     if isinstance(kind, types.Metadata):
         kind = kind.type
     if isinstance(kind, types.TupleType):
@@ -84,7 +84,7 @@ def _word(kind: Any) -> FieldType | None:
         return f"number[{len(kind.item_types)}]" if numbers and 1 <= len(kind.item_types) <= COUNT_MAX else None
     if isinstance(kind, types.VarTupleType | types.ListType):
         return "number[]" if isinstance(kind.item_type, types.FloatType) else None
-    return _WORDS.get(type(kind))
+    return _TYPE_NAMES.get(type(kind))
 
 
 def declared_type(
@@ -101,5 +101,5 @@ def declared_type(
 def _declared_type(
     name: str, fields: tuple[tuple[str, str], ...], base: type[Struct], namespace: tuple[tuple[str, Any], ...]
 ) -> Any:
-    own: Any = [(field, _TYPES.get(word) or tuple[(Number,) * int(word[7:-1])]) for field, word in fields]  # type: ignore[misc]
+    own: Any = [(field, _TYPES.get(kind) or tuple[(Number,) * int(kind[7:-1])]) for field, kind in fields]  # type: ignore[misc]
     return msgspec.defstruct(name, own, bases=(base,), namespace=dict(namespace), frozen=True, gc=False)

@@ -46,9 +46,9 @@ def parameters_type(kind: Callable[..., Any], filled: tuple[str, ...] = ()) -> t
 
 
 def _arguments(kind: Callable[..., Any], filled: tuple[str, ...]) -> Iterator[Any]:
-    taken = signature(kind).parameters.values()
+    arguments = signature(kind).parameters.values()
     hints = get_type_hints(kind.__init__ if isinstance(kind, type) else kind, include_extras=True)
-    for each in taken:
+    for each in arguments:
         if each.name in filled or each.kind in (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD):
             continue
         hint = hints.get(each.name, Any)

@@ -45,16 +45,16 @@ MODULE_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*\Z"
 CLASS_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z"
 
 
-def search(*places: Path) -> None:
+def search(*paths: Path) -> None:
     """Search for modules in the folders of the current document, in this process and its child processes.
 
     Former folders are replaced, so that the environment of a program that reads many documents does not grow.
 
     Args:
-        places: folders, the document's first; missing folders are ignored.
+        paths: folders, the document's first; missing folders are ignored.
     """
-    found = dict.fromkeys(str(place.resolve()) for place in places if place.is_dir())
-    os.environ[FOLDERS] = json.dumps([*found])  # a folder's name may contain any separator
+    existing = dict.fromkeys(str(path.resolve()) for path in paths if path.is_dir())
+    os.environ[FOLDERS] = json.dumps([*existing])  # a folder's name may contain any separator
 
 
 def folders() -> tuple[Path, ...]:
@@ -63,8 +63,8 @@ def folders() -> tuple[Path, ...]:
 
 def beside(name: str) -> Path:
     """Return the path of a file named in a scenario, in a folder of its modules or in the working directory."""
-    places = [folder / name for folder in (*folders(), Path())]
-    return next((place for place in places if place.is_file()), places[0])
+    candidates = [folder / name for folder in (*folders(), Path())]
+    return next((path for path in candidates if path.is_file()), candidates[0])
 
 
 @contextmanager
@@ -113,10 +113,10 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
         lacks = f"{where} is {show(name)}, which has no {', '.join(missing)}()"
         raise DocumentError([f"{lacks}; must have the methods of {kind.__name__.removesuffix('Methods')}"])
     for method in ["__init__", *methods] if is_constructed else methods:
-        if (found := _other_arguments(loaded, kind, method)) is not None:
-            taken, given = found
-            what = f"{where} is {show(name)}, whose {method} takes ({taken})"
-            raise DocumentError([f"{what}; must take ({given}), as that of {kind.__name__}"])
+        if (mismatch := _other_arguments(loaded, kind, method)) is not None:
+            actual, expected = mismatch
+            fault = f"{where} is {show(name)}, whose {method} takes ({actual})"
+            raise DocumentError([f"{fault}; must take ({expected}), as that of {kind.__name__}"])
     return loaded
 
 
@@ -127,7 +127,7 @@ def load_function(name: str, where: str) -> Callable[..., Any]:
 
 def load_any(name: str, where: str, kind: type) -> Any:
     """Return the class, function or instance of `kind` named `package.module:Name`; errors as for `load`."""
-    return _attribute(name, where, "class", lambda found: callable(found) or isinstance(found, kind))
+    return _attribute(name, where, "class", lambda value: callable(value) or isinstance(value, kind))
 
 
 def load_module(name: str, where: str) -> ModuleType:
@@ -137,11 +137,11 @@ def load_module(name: str, where: str) -> ModuleType:
 
 def load_object(name: str, where: str, attribute: str, kind: type[Object]) -> Object:
     """Return the instance of `kind` that a module `package.module` defines as `attribute`; errors as for `load`."""
-    found = getattr(load_module(name, where), attribute, None)
-    if not isinstance(found, kind):
-        holds = f"whose {attribute} is {show(type(found).__name__)}" if found else f"which defines no {attribute}"
+    value = getattr(load_module(name, where), attribute, None)
+    if not isinstance(value, kind):
+        holds = f"whose {attribute} is {show(type(value).__name__)}" if value else f"which defines no {attribute}"
         raise DocumentError([f"{where} is {show(name)}, {holds}; must be a {kind.__module__}.{kind.__name__}"])
-    return found
+    return value
 
 
 def is_own(kind: type) -> bool:
@@ -180,14 +180,14 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
     (called, _), (deepest, line) = frames[0], frames[-1]
     method = f"{called.f_globals.get('__name__', '')}:{called.f_code.co_qualname}"
     raised = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
-    return UserCodeError(f"{method} raised {raised} ({_place(deepest.f_code.co_filename, line)})", where)
+    return UserCodeError(f"{method} raised {raised} ({_location(deepest.f_code.co_filename, line)})", where)
 
 
 def innermost_line(frame: FrameType | None) -> str:
     """Return file and line of the innermost user code on a frame's stack, in parentheses; empty without any."""
     while frame and not is_user_frame(frame):
         frame = frame.f_back
-    return f" ({_place(frame.f_code.co_filename, frame.f_lineno)})" if frame else ""
+    return f" ({_location(frame.f_code.co_filename, frame.f_lineno)})" if frame else ""
 
 
 def is_user_frame(frame: FrameType) -> bool:
@@ -225,15 +225,15 @@ def raised_by_user(failure: UserCodeError) -> BaseException | None:
 _CELL = re.compile(r".*ipykernel_\d+[/\\]\d+\.py|<ipython-input-(\d+)-.*>")
 
 
-def _place(path: str, line: int) -> str:
+def _location(path: str, line: int) -> str:
     """Return file and line, or a notebook's cell and line, as text."""
     cell = _CELL.fullmatch(path)
     if cell is None:
         return f"{path.removeprefix(f'{os.getcwd()}{os.sep}')}:{line}"
     notebook = sys.modules.get("IPython")  # absent outside IPython and notebooks
     shell = notebook.get_ipython() if notebook else None
-    named = shell.compile.format_code_name(path) if shell else None
-    number = f"In[{cell[1]}]" if cell[1] else named[1] if named else "of the notebook"
+    formatted = shell.compile.format_code_name(path) if shell else None
+    number = f"In[{cell[1]}]" if cell[1] else formatted[1] if formatted else "of the notebook"
     return f"cell {number}, line {line}"
 
 
@@ -247,28 +247,28 @@ def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool])
     if not (colon and module_name and attribute):
         raise DocumentError([f"{where} is {show(name)}; must be package.module:{kind}"])
     module = _imported(module_name, f"{where} is {show(name)}", attribute)
-    found = getattr(module, attribute, None)
-    if not is_kind(found):
+    value = getattr(module, attribute, None)
+    if not is_kind(value):
         if module_name.startswith(MADE):  # the user passed an object in Python, not a name
-            raise DocumentError([f"{where} is {show(found)}; must be a {kind.lower()}, or a name, e.g. module:{kind}"])
+            raise DocumentError([f"{where} is {show(value)}; must be a {kind.lower()}, or a name, e.g. module:{kind}"])
         is_one = isfunction if kind == "function" else isclass
         own = [each for each in vars(module).values() if is_one(each) and each.__module__ == module.__name__]
         names = sorted(each.__name__ for each in own if not each.__name__.startswith("_"))
         allowed = f"must be a {kind.lower()} of {module_name}: {', '.join(names) or 'it has none'}"
         raise DocumentError([f"{where} is {show(name)}; {allowed}"])
-    return found
+    return value
 
 
-def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
+def _imported(name: str, label: str, attribute: str = "") -> ModuleType:
     """Import a module if allowed; otherwise check that it exists and that its source defines `attribute`."""
     package = name.partition(".")[0]
     if not may_import() and package not in PACKAGES:
         if os.environ[IMPORTS] != NO_LOOKUP:
-            _find(name, what, attribute)
+            _find(name, label, attribute)
         full = f"{name}:{attribute}" if attribute else name
         if full not in _SKIPPED:
             _SKIPPED.append(full)
-        raise NotTrustedError([f"{what}, code that comes with the document and is imported only with --trust"])
+        raise NotTrustedError([f"{label}, code that comes with the document and is imported only with --trust"])
     _LOADED.add(package)
     for folder in map(str, folders()):
         if folder not in sys.path:
@@ -277,46 +277,46 @@ def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
         return importlib.import_module(name)
     except RAISED as error:
         if isinstance(error, ModuleNotFoundError) and (lacking := errors.missing(error)):
-            raise DocumentError([f"{what}, which cannot be imported: {lacking}"]) from error
-        raise DocumentError([f"{what}, which cannot be imported ({reason_of(error)})"]) from error
+            raise DocumentError([f"{label}, which cannot be imported: {lacking}"]) from error
+        raise DocumentError([f"{label}, which cannot be imported ({reason_of(error)})"]) from error
 
 
-def located(name: str, what: str) -> ModuleSpec:
+def located(name: str, label: str) -> ModuleSpec:
     """Return the spec of a module without running it.
 
     Raises:
-        DocumentError: the module does not exist; the text begins with `what`.
+        DocumentError: the module does not exist; the text begins with `label`.
     """
     spec: ModuleSpec | None = None
     for part in accumulate(name.split("."), "{}.{}".format):
         where = spec.submodule_search_locations if spec else None
         if spec and where is None:
-            raise DocumentError([f"{what}, and {spec.name} is not a package; {WHERE}"])
+            raise DocumentError([f"{label}, and {spec.name} is not a package; {WHERE}"])
         if where is not None:
             spec = PathFinder.find_spec(part, list(where))
         else:
-            found = (finder.find_spec(part, None) for finder in sys.meta_path)
-            spec = next(filter(None, found), None) or PathFinder.find_spec(part, list(map(str, folders())))
+            specs = (finder.find_spec(part, None) for finder in sys.meta_path)
+            spec = next(filter(None, specs), None) or PathFinder.find_spec(part, list(map(str, folders())))
         if spec is None:
             reason = f"ModuleNotFoundError: No module named {part!r}"
-            raise DocumentError([f"{what}, which cannot be imported ({reason}); {WHERE}"])
+            raise DocumentError([f"{label}, which cannot be imported ({reason}); {WHERE}"])
     assert spec is not None  # every name has at least one part
     return spec
 
 
-def _find(name: str, what: str, attribute: str) -> None:
+def _find(name: str, label: str, attribute: str) -> None:
     """Check, without running a module, that it exists and binds `attribute`; DocumentError if not."""
-    spec = located(name, what)
+    spec = located(name, label)
     if not attribute or not (spec.origin or "").endswith(".py"):
         return
     try:
         tree = ast.parse(Path(spec.origin or "").read_bytes())
         bound = _bound(tree)
     except (OSError, SyntaxError, ValueError) as error:
-        raise DocumentError([f"{what}, which cannot be imported ({reason_of(error)})"]) from error
+        raise DocumentError([f"{label}, which cannot be imported ({reason_of(error)})"]) from error
     if attribute not in bound and "*" not in bound:
         own = sorted(bound - _imported_names(tree)) or ["it defines nothing"]
-        raise DocumentError([f"{what}; must be one that {name} defines: {', '.join(own)}"])
+        raise DocumentError([f"{label}; must be one that {name} defines: {', '.join(own)}"])
 
 
 def _bound(body: ast.AST) -> set[str]:
@@ -342,15 +342,15 @@ def _imported_names(tree: ast.AST) -> set[str]:
 
 def _other_arguments(loaded: type, kind: type, method: str) -> tuple[str, str] | None:
     """Return the actual and expected parameters of a method that cannot be called like that of `kind`; else None."""
-    wanted, own = getattr_static(kind, method), getattr_static(loaded, method)
-    if not (isfunction(wanted) and isfunction(own)) or wanted is own:
+    expected, own = getattr_static(kind, method), getattr_static(loaded, method)
+    if not (isfunction(expected) and isfunction(own)) or expected is own:
         return None  # a builtin or another kind of descriptor, whose arguments are unknown
     positional, required = Parameter.POSITIONAL_OR_KEYWORD, Parameter.empty
-    parameters = signature(wanted).parameters.items()
-    given = [name for name, each in parameters if each.default is required and each.kind is positional]
+    parameters = signature(expected).parameters.items()
+    names = [name for name, each in parameters if each.default is required and each.kind is positional]
     takes = signature(own)
     try:
-        takes.bind(*given)
+        takes.bind(*names)
     except TypeError:
-        return ", ".join(map(str, list(takes.parameters.values())[1:])), ", ".join(given[1:])
+        return ", ".join(map(str, list(takes.parameters.values())[1:])), ", ".join(names[1:])
     return None

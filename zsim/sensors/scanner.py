@@ -178,5 +178,5 @@ SCANNERS: dict[str, type[Sample]] = {"range": Range, "lidar": Lidar, "depth": De
 
 def scanners(sensors: object) -> dict[str, Scanner]:
     """Return the scanner settings of a drone's sensors by name, in the order of SCANNERS."""
-    found = {name: getattr(sensors, name) for name in SCANNERS}
-    return {name: settings for name, settings in found.items() if settings is not UNSET}
+    by_name = {name: getattr(sensors, name) for name in SCANNERS}
+    return {name: settings for name, settings in by_name.items() if settings is not UNSET}

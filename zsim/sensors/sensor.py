@@ -237,14 +237,14 @@ def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:
         ValueError: the fields need a different count of numbers.
     """
     values, at = [], 0
-    for word in fields.values():
-        count = int(word[7:-1]) if word.startswith("number[") else 1
+    for type_name in fields.values():
+        count = int(type_name[7:-1]) if type_name.startswith("number[") else 1
         part = numbers[at : at + count]
         at += len(part)
         if len(part) < count:
             break
-        if word in ("number", "whole", "flag"):
-            values.append({"number": float, "whole": int, "flag": bool}[word](part[0]))
+        if type_name in ("number", "whole", "flag"):
+            values.append({"number": float, "whole": int, "flag": bool}[type_name](part[0]))
         else:
             values.append(tuple(map(float, part)))
     if at != len(numbers) or len(values) < len(fields):

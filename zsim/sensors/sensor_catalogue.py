@@ -67,8 +67,8 @@ class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     see `flattened`."""
 
     def cameras(self) -> dict[str, Camera]:
-        found = {name: getattr(self, f"{name}_camera") for name in CAMERAS}
-        return {name: camera for name, camera in found.items() if camera is not UNSET}
+        by_name = {name: getattr(self, f"{name}_camera") for name in CAMERAS}
+        return {name: camera for name, camera in by_name.items() if camera is not UNSET}
 
     def sections(self) -> Iterator[tuple[str, SensorType, Sensor]]:
         """Yield the name, type and settings of every sensor, importing users' modules.
@@ -83,8 +83,8 @@ class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             kind = sensor_type(section[MODULE], f"{where}.{MODULE}")
             wrong = [f"{path} {text}" for path, text in faults(_settings_of(section), kind.settings, where)]
             if section[DECLARED] != _plain(Declaration.of(kind)):
-                what = f"{where}.{DECLARED} is not what {section[MODULE]} declares here"
-                wrong.append(f"{what}; the scenario must be resolved with the same version of the module")
+                mismatch = f"{where}.{DECLARED} is not what {section[MODULE]} declares here"
+                wrong.append(f"{mismatch}; the scenario must be resolved with the same version of the module")
             if wrong:
                 raise DocumentError(wrong)
             yield name, kind, msgspec.convert(_settings_of(section), kind.settings)
@@ -126,19 +126,19 @@ def _check(sensor: SensorType) -> None:
     shared, own = (get_type_hints(kind, include_extras=True) for kind in (Sensor, sensor.settings))
     for name, kind in shared.items():
         if own[name] != kind:  # another type would drop the limits of the shared setting
-            what = f"settings: {sensor.settings.__name__}.{name} has a type of its own"
-            raise TypeError(f"{what}; must have that of zsim.sensors.sensor.Sensor, e.g. RateHz, LatencyMs")
+            fault = f"settings: {sensor.settings.__name__}.{name} has a type of its own"
+            raise TypeError(f"{fault}; must have that of zsim.sensors.sensor.Sensor, e.g. RateHz, LatencyMs")
     fields = Declaration.of(sensor).fields
     if sensor.equation is None:
         raise ValueError("equation is missing; must be a function of truth, settings and environment")
     if not 1 <= sensor.values <= VALUES_MAX:
         raise ValueError(f"channels have {sensor.values} numbers with the exact ones; must have 1 to {VALUES_MAX}")
-    for place, channel in enumerate(sensor.channels):
+    for index, channel in enumerate(sensor.channels):
         if channel.settings not in sensor.settings.__struct_fields__:
             allowed = f"must be a field of {sensor.settings.__name__}"
-            raise ValueError(f"channels[{place}].settings is {channel.settings!r}; {allowed}")
+            raise ValueError(f"channels[{index}].settings is {channel.settings!r}; {allowed}")
         if channel.part:
-            raise ValueError(f"channels[{place}].part is {channel.part!r}; must be left out of a sensor of your own")
+            raise ValueError(f"channels[{index}].part is {channel.part!r}; must be left out of a sensor of your own")
     if sensor.convert is None:
         try:
             as_fields([0.0] * sensor.values, fields)
@@ -154,7 +154,7 @@ def separate(
     A resolved sensor is returned unchanged, so that readers of `world/info` import nothing. Without `imports`, an
     unresolved sensor is a fault; a sensor whose module must not be imported (`plugin.names_only`) is omitted.
     """
-    rest = {name: value for name, value in section.items() if name in FIELDS}
+    stock = {name: value for name, value in section.items() if name in FIELDS}
     own: dict[str, dict[str, Any]] = {}
     wrong: list[Fault] = []
     for name, value in section.items():
@@ -177,13 +177,13 @@ def separate(
             kind = sensor_type(value[MODULE])
             settings = _plain(msgspec.convert(_settings_of(value), kind.settings))
             own[name] = {MODULE: value[MODULE], DECLARED: _plain(Declaration.of(kind)), **settings}
-    return rest, dict(sorted(own.items())), wrong
+    return stock, dict(sorted(own.items())), wrong
 
 
 def flattened(sensors: dict[str, Any]) -> dict[str, Any]:
     """Return a resolved `sensors:` section in the form of a file, with users' sensors among the others."""
-    rest = {name: value for name, value in sensors.items() if name != "own"}
-    return rest | sensors.get("own", {})
+    stock = {name: value for name, value in sensors.items() if name != "own"}
+    return stock | sensors.get("own", {})
 
 
 def declarations(drones: Any) -> dict[str, Declaration]:
@@ -291,7 +291,7 @@ def in_channel_units(sensors: dict[str, Any], where: str) -> tuple[Any, list[Fau
         section = sensors.get(name)
         if not isinstance(section, dict):
             continue
-        read[name] = section = _of_kalibr(section, f"{where}.{name}", wrong) if name == "imu" else dict(section)
+        read[name] = section = _from_kalibr(section, f"{where}.{name}", wrong) if name == "imu" else dict(section)
         for channel in kind.channels:
             model, path = section.get(channel.settings), f"{where}.{name}.{channel.settings}"
             if isinstance(model, dict):
@@ -299,22 +299,22 @@ def in_channel_units(sensors: dict[str, Any], where: str) -> tuple[Any, list[Fau
     return read, wrong
 
 
-def _of_kalibr(section: dict[str, Any], where: str, wrong: list[Fault]) -> dict[str, Any]:
+def _from_kalibr(section: dict[str, Any], where: str, wrong: list[Fault]) -> dict[str, Any]:
     read = {key: value for key, value in section.items() if key not in KALIBR}
-    for key, place in KALIBR.items():
+    for key, path in KALIBR.items():
         if key not in section:
             continue
-        found = [*faults(section[key], RateHz if len(place) == 1 else NonNegative, f"{where}.{key}")]
-        inside = read if len(place) == 1 else read.get(place[0], {})
-        if isinstance(inside, dict) and place[-1] in inside:
-            found.append((f"{where}.{key}", f"is given together with {'.'.join(place)}; must be only one of them"))
-        wrong += found
-        if found or not isinstance(inside, dict):
+        flaws = [*faults(section[key], RateHz if len(path) == 1 else NonNegative, f"{where}.{key}")]
+        inside = read if len(path) == 1 else read.get(path[0], {})
+        if isinstance(inside, dict) and path[-1] in inside:
+            flaws.append((f"{where}.{key}", f"is given together with {'.'.join(path)}; must be only one of them"))
+        wrong += flaws
+        if flaws or not isinstance(inside, dict):
             continue
-        if len(place) == 1:
-            read[place[0]] = section[key]
+        if len(path) == 1:
+            read[path[0]] = section[key]
         else:
-            read[place[0]] = {**inside, place[1]: section[key]}
+            read[path[0]] = {**inside, path[1]: section[key]}
     return read
 
 
@@ -322,11 +322,11 @@ def _in_unit(model: dict[str, Any], units: dict[str, Unit], where: str, wrong: l
     read = {key: value for key, value in model.items() if key not in units}
     for key, unit in units.items():
         if key in model:
-            found = [*faults(model[key], NonNegative, f"{where}.{key}")]
+            flaws = [*faults(model[key], NonNegative, f"{where}.{key}")]
             if unit.field in read:
                 text = f"is given together with another field for {unit.field}; must be the only one"
-                found.append((f"{where}.{key}", text))
-            wrong += found
-            if not found:
+                flaws.append((f"{where}.{key}", text))
+            wrong += flaws
+            if not flaws:
                 read[unit.field] = unit.factor * model[key]
     return read

@@ -121,12 +121,12 @@ def _listening(
 
 def no_listening(endpoints: Sequence[str], error: str) -> SessionError:
     """Return the error of a hub that could not listen, with the remedy; `error` is Zenoh's text."""
-    found = _OS_ERROR.search(error)
-    why = _LISTEN_FAULTS.get(int(found[1]) if found else 0)
-    if why is None:
-        why = next((words for text, words in _LISTEN_TEXTS.items() if text in error), None)
+    match = _OS_ERROR.search(error)
+    reason = _LISTEN_FAULTS.get(int(match[1]) if match else 0)
+    if reason is None:
+        reason = next((fault for text, fault in _LISTEN_TEXTS.items() if text in error), None)
     text = f"cannot listen on {', '.join(endpoints)}"
-    return SessionError(f"{text}: {why}" if why else f"{text} ({error}); {_OTHER}")
+    return SessionError(f"{text}: {reason}" if reason else f"{text} ({error}); {_OTHER}")
 
 
 @contextmanager
@@ -172,8 +172,8 @@ def find_world(
             except NoListenerError:
                 pass
             if waited_s >= limit_s:
-                why = _no_answer(link, identity) if link is not None else _no_link(endpoint)
-                raise NoWorldError(f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s{why}")
+                reason = _no_answer(link, identity) if link is not None else _no_link(endpoint)
+                raise NoWorldError(f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s{reason}")
             if waited_s >= next_say_s:
                 next_say_s = max(2 * next_say_s, 1.0)
                 say(f"waiting for a world of {federation!r} on {endpoint} ({waited_s:.0f} s)")
@@ -199,15 +199,15 @@ def _no_answer(link: Session, identity: Identity | None) -> str:
 
 def _no_link(endpoint: str) -> str:
     """Return why no session opened; a port that accepts connections may use TLS or another protocol."""
-    nobody = "; start one with `zsim world`"
-    protocol, _, place = endpoint.partition("/")
+    hint = "; start one with `zsim world`"
+    protocol, _, address = endpoint.partition("/")
     if protocol != "tcp":
-        return nobody
-    host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
+        return hint
+    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
     try:
         socket.create_connection((host.strip("[]"), int(port)), ANSWER_S).close()
     except (OSError, OverflowError, ValueError):
-        return nobody
+        return hint
     return ", but the process that listens there refuses us; for a world with TLS, use tls/ and --tls FOLDER"
 
 

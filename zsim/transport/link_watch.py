@@ -35,11 +35,11 @@ LOOK_S = 0.05  # wall time between checks
 STALL_BYTES = 1 << 16  # unacknowledged bytes at which a link is watched; the kernel accepts 0.4 MB or more (measured)
 STALL_S = 0.1  # wall time within which a live far end acknowledges something, in addition to …
 ROUND_TRIPS = 3.0  # … this many of its round trips
-HELD_BYTES, HELD_S = 1 << 20, 1.0  # limits for a reader that keeps reading, but never catches up
-FRESH_S = 0.2  # wall time between updates of the sessions at the far ends
-SPARED, SPARED_S = 3, 60.0  # a session whose links are closed this often within this time is kept out …
-KEPT_OUT_S = 30.0  # … for this time
-TOLD_S = 10.0  # wall time between reports on one session
+BACKLOG_MAX_BYTES, BACKLOG_MAX_S = 1 << 20, 1.0  # limits for a reader that keeps reading, but never catches up
+REFRESH_PERIOD_S = 0.2  # wall time between updates of the sessions at the far ends
+CLOSURES_MAX, CLOSURES_WINDOW_S = 3, 60.0  # a session whose links are closed this often within this time is kept out …
+EXCLUSION_S = 30.0  # … for this time
+REPORT_PERIOD_S = 10.0  # wall time between reports on one session
 
 OWN_FILES = "/proc/self/fd"
 TCP_INFO = struct.Struct("68xI48xQ")  # tcpi_rtt [µs] and tcpi_bytes_acked in struct tcp_info, linux/tcp.h
@@ -93,13 +93,13 @@ class LinkWatch:
         self._wall_s = wall_s
         self._backlogs: dict[str, _Backlog] = {}
         self._far_ends: dict[str, FarEnd] = {}
-        self._refreshed_s = -FRESH_S
+        self._refreshed_s = -REFRESH_PERIOD_S
         self._times: dict[str, list[float]] = {}  # wall times at which links were closed, by session
-        self._told_s: dict[str, float] = {}  # wall time of the last report, by session
-        self._kept_out_s: dict[str, float] = {}
-        self._over = threading.Event()
+        self._reported_s: dict[str, float] = {}  # wall time of the last report, by session
+        self._excluded_until_s: dict[str, float] = {}
+        self._stop_event = threading.Event()
         self._thread = threading.Thread(target=self._run, name="links", daemon=True)
-        # links closed, oldest first, at most one per session in TOLD_S; consumed by the caller
+        # links closed, oldest first, at most one per session in REPORT_PERIOD_S; consumed by the caller
         self.closed: deque[ClosedLink] = deque()
 
     def __enter__(self) -> "LinkWatch":
@@ -107,11 +107,11 @@ class LinkWatch:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._over.set()
+        self._stop_event.set()
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._over.wait(LOOK_S):
+        while not self._stop_event.wait(LOOK_S):
             self.look()
 
     def look(self) -> None:
@@ -119,19 +119,19 @@ class LinkWatch:
         now_s, queued = self._wall_s(), self._sockets.queued()
         self._backlogs = {address: self._backlogs[address] for address in queued if address in self._backlogs}
         for address, held_bytes in queued.items():
-            if self._holds_up(address, held_bytes, now_s) or self._is_kept_out(address, now_s):
+            if self._holds_up(address, held_bytes, now_s) or self._is_excluded(address, now_s):
                 self._judge(address, held_bytes, now_s)
 
     def stuck(self) -> list[str]:
         """Return the processes at the far ends of stalled links, the fullest link first."""
         queued, before_s = self._sockets.queued(), self._wall_s() - STALL_S
-        standing = [address for address, backlog in self._backlogs.copy().items() if backlog.moved_s <= before_s]
+        stalled = [address for address, backlog in self._backlogs.copy().items() if backlog.moved_s <= before_s]
         lines = []
-        for address in sorted(standing, key=lambda address: -queued.get(address, 0)):
-            far = self._far_ends.get(address)
-            names = self._tokens.processes(far.session) if far else ()
-            who = " ".join(names) or ("a router" if far and far.is_router else "an unknown process")
-            lines.append(f"{who} at {address}")
+        for address in sorted(stalled, key=lambda address: -queued.get(address, 0)):
+            far_end = self._far_ends.get(address)
+            names = self._tokens.processes(far_end.session) if far_end else ()
+            processes = " ".join(names) or ("a router" if far_end and far_end.is_router else "an unknown process")
+            lines.append(f"{processes} at {address}")
         return lines
 
     def _holds_up(self, address: str, held_bytes: int, now_s: float) -> bool:
@@ -143,29 +143,29 @@ class LinkWatch:
         backlog = self._backlogs.setdefault(address, _Backlog(acknowledged, now_s, now_s))
         if acknowledged != backlog.acknowledged:
             backlog.acknowledged, backlog.moved_s = acknowledged, now_s
-        if held_bytes < HELD_BYTES:
+        if held_bytes < BACKLOG_MAX_BYTES:
             backlog.low_s = now_s
         stall_s = STALL_S + ROUND_TRIPS * round_trip_s
-        return now_s - backlog.moved_s >= stall_s or now_s - backlog.low_s >= HELD_S
+        return now_s - backlog.moved_s >= stall_s or now_s - backlog.low_s >= BACKLOG_MAX_S
 
-    def _is_kept_out(self, address: str, now_s: float) -> bool:
-        if now_s >= max(self._kept_out_s.values(), default=now_s):
+    def _is_excluded(self, address: str, now_s: float) -> bool:
+        if now_s >= max(self._excluded_until_s.values(), default=now_s):
             return False
-        far = self._far_end(address, now_s)
-        return far is not None and now_s < self._kept_out_s.get(far.session, now_s)
+        far_end = self._far_end(address, now_s)
+        return far_end is not None and now_s < self._excluded_until_s.get(far_end.session, now_s)
 
     def _far_end(self, address: str, now_s: float) -> FarEnd | None:
-        if now_s - self._refreshed_s >= FRESH_S:
+        if now_s - self._refreshed_s >= REFRESH_PERIOD_S:
             self._refreshed_s = now_s
             self._far_ends = self._link.far_ends()
         return self._far_ends.get(address)
 
     def _judge(self, address: str, held_bytes: int, now_s: float) -> None:
         """Close a link unless a participant is, or may be, at its far end."""
-        far, inode = self._far_end(address, now_s), local_socket(address)
-        if far is None or far.is_router:
+        far_end, inode = self._far_end(address, now_s), local_socket(address)
+        if far_end is None or far_end.is_router:
             return
-        awaited, names = self._awaited(), self._tokens.processes(far.session)
+        awaited, names = self._awaited(), self._tokens.processes(far_end.session)
         if any(name in each.names for each in awaited for name in names):
             return
         pid = owner(inode)
@@ -175,13 +175,16 @@ class LinkWatch:
                 return
         self._sockets.close(address)
         self._backlogs.pop(address, None)
-        times = self._times.setdefault(far.session, [])
+        times = self._times.setdefault(far_end.session, [])
         times.append(now_s)
-        if len(times) >= SPARED and now_s - times[-SPARED] < SPARED_S:
-            self._kept_out_s[far.session] = now_s + KEPT_OUT_S
+        if len(times) >= CLOSURES_MAX and now_s - times[-CLOSURES_MAX] < CLOSURES_WINDOW_S:
+            self._excluded_until_s[far_end.session] = now_s + EXCLUSION_S
         # a link without a backlog, such as that of a session kept out, is not reported
-        if held_bytes >= STALL_BYTES and now_s - self._told_s.get(far.session, -TOLD_S) >= TOLD_S:
-            self._told_s[far.session] = now_s
+        if (
+            held_bytes >= STALL_BYTES
+            and now_s - self._reported_s.get(far_end.session, -REPORT_PERIOD_S) >= REPORT_PERIOD_S
+        ):
+            self._reported_s[far_end.session] = now_s
             self.closed.append(ClosedLink(address, command(pid), names, held_bytes, len(times)))
 
 
@@ -248,7 +251,7 @@ class LinkSockets:
     """
 
     def __init__(self) -> None:
-        self._far: dict[tuple[int, int], str] = {}  # address by file descriptor and inode; empty if not a connection
+        self._addresses: dict[tuple[int, int], str] = {}  # by file descriptor and inode; empty if not a connection
 
     def queued(self) -> dict[str, int]:
         """Return the bytes in the kernel's send queue of each far end."""
@@ -275,8 +278,8 @@ class LinkSockets:
 
     def _open(self, address: str) -> socket.socket:
         """Return a duplicate of a connection's socket; OSError if it is gone."""
-        for file, far in self._connections().items():
-            if far == address:
+        for file, far_address in self._connections().items():
+            if far_address == address:
                 duplicate = socket.socket(fileno=os.dup(file))
                 if _far_end(duplicate) == address:
                     return duplicate
@@ -285,21 +288,21 @@ class LinkSockets:
 
     def _connections(self) -> dict[int, str]:
         """Return the addresses of the TCP connections' far ends by file descriptor, and disable lingering on all."""
-        far: dict[tuple[int, int], str] = {}
+        addresses: dict[tuple[int, int], str] = {}
         for name in os.listdir(OWN_FILES):
             with suppress(OSError):
                 file, status = int(name), os.fstat(int(name))
                 if not stat.S_ISSOCK(status.st_mode):
                     continue
-                known = self._far.get((file, status.st_ino))
-                far[file, status.st_ino] = known or ""
-                if known is None:
+                cached = self._addresses.get((file, status.st_ino))
+                addresses[file, status.st_ino] = cached or ""
+                if cached is None:
                     with socket.socket(fileno=os.dup(file)) as duplicate:
                         if address := _far_end(duplicate):
                             duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, IN_BACKGROUND)
-                            far[file, status.st_ino] = address
-        self._far = far
-        return {file: address for (file, _), address in far.items() if address}
+                            addresses[file, status.st_ino] = address
+        self._addresses = addresses
+        return {file: address for (file, _), address in addresses.items() if address}
 
 
 def _far_end(connection: socket.socket) -> str:

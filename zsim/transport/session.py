@@ -97,7 +97,7 @@ class Subscription:
     def __init__(self, raw: zenoh.Session, prefix: str, expression: str, without: tuple[str, ...] = ()) -> None:
         self._raw = raw
         self._without = without
-        self._cut = len(prefix)
+        self._prefix_length = len(prefix)
         self._key = None if "*" in expression else expression
         self.expression = expression
         self._wake_key = prefix + expression.replace("**", "wake").replace("*", "wake")
@@ -136,7 +136,7 @@ class Subscription:
         self._subscriber.undeclare()
 
     def _take(self, raw: zenoh.Sample) -> ReceivedSample | None:
-        key = self._key or str(raw.key_expr)[self._cut :]
+        key = self._key or str(raw.key_expr)[self._prefix_length :]
         if self._without and (key.startswith(self._without) or keys.is_picture(key)):
             return None
         payload = raw.payload.to_bytes()
@@ -244,8 +244,8 @@ class Session:
         if self.permissions is None:
             return None
         with _key_errors(expression):
-            wanted = zenoh.KeyExpr(self._prefix + expression)
-            if any(zenoh.KeyExpr(each).includes(wanted) for each in self.permissions.allowed.get(act, ())):
+            requested = zenoh.KeyExpr(self._prefix + expression)
+            if any(zenoh.KeyExpr(each).includes(requested) for each in self.permissions.allowed.get(act, ())):
                 return None
         return self.permissions.denial(act, expression, self._prefix)
 
@@ -397,13 +397,13 @@ class Session:
         with _key_errors(expression):
             selector = zenoh.Selector(self._prefix + expression, parameters)
             replies = self._raw.get(selector, timeout=timeout_s, **body)
-        found = []
+        samples = []
         for reply in replies:
             if reply.ok is not None:
-                found.append(_raw_sample(reply.ok, self._prefix))
+                samples.append(_raw_sample(reply.ok, self._prefix))
             elif reply.err is not None:
-                found.append(RawSample("ERROR", "", reply.err.payload.to_bytes(), str(reply.err.encoding), None))
-        return found
+                samples.append(RawSample("ERROR", "", reply.err.payload.to_bytes(), str(reply.err.encoding), None))
+        return samples
 
     def get(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample]:
         """Return the last values of the keys that match an expression."""
@@ -436,9 +436,9 @@ class Session:
         for reply in self.query(key, payload=payload, timeout_s=timeout_s):
             if reply.kind != "ERROR":
                 return messages.decode_as(ControlAnswer, reply.payload, key)
-        late = time.monotonic() - start_s >= timeout_s
-        what = f"no answer came within {timeout_s:g} s" if late else "no process answers there"
-        return Unanswered(ok=False, error=f"{key}: {what}; is it running?")
+        is_timeout = time.monotonic() - start_s >= timeout_s
+        cause = f"no answer came within {timeout_s:g} s" if is_timeout else "no process answers there"
+        return Unanswered(ok=False, error=f"{key}: {cause}; is it running?")
 
     def declare_queryable(self, expression: str, callback: Callable[[Query], None], complete: bool = False) -> None:
         """Call back for every query, on a Zenoh thread; `complete` means that no other process needs to be queried."""

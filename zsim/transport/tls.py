@@ -28,9 +28,9 @@ PROBE_S = 2.0  # timeout of each step of the handshake; a running listener answe
 LATE_S = 1.0  # in TLS 1.3 a server checks the client's certificate after the client has finished
 NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME, openssl/x509_vfy.h
 NETWORKED = ("tcp", "udp", "ws")  # unencrypted protocols in Zenoh's wheel that leave the machine
-MEND = "make new ones with zsim certs init"
-RENEW = f"{MEND} --renew"
-ADDRESS_MEND = f"name that in the hosts file and {MEND}, or connect to another address"
+REMEDY = "make new ones with zsim certs init"
+RENEW = f"{REMEDY} --renew"
+ADDRESS_REMEDY = f"name that in the hosts file and {REMEDY}, or connect to another address"
 Act = Literal["publish", "read", "ask"]
 MESSAGES: dict[Act, str] = {"publish": "put", "read": "declare_subscriber", "ask": "query"}  # Zenoh's names
 SHOWN_MAX = 4  # names or expressions shown in a line
@@ -63,8 +63,8 @@ def is_tls(endpoint: str) -> bool:
 
 def leaves_machine(endpoint: str) -> bool:
     """Whether unencrypted links of an endpoint use a network; False for a malformed endpoint."""
-    protocol, _, place = endpoint.partition("/")
-    host = (place.rpartition(":")[0] or place).strip("[]")
+    protocol, _, address = endpoint.partition("/")
+    host = (address.rpartition(":")[0] or address).strip("[]")
     if protocol not in NETWORKED or host == "localhost":
         return False
     try:
@@ -85,13 +85,13 @@ def own_fault(identity: Identity) -> str | None:
     try:
         certificate = _read_own(identity)
     except (ssl.SSLError, ValueError) as error:
-        return f"{identity.tls}: certificate.pem, key.pem and ca.pem do not match ({_reason(error)}); {MEND}"
+        return f"{identity.tls}: certificate.pem, key.pem and ca.pem do not match ({_reason(error)}); {REMEDY}"
     if fault := _date_fault(certificate):
         return fault
-    found, wanted = _name(certificate), identity.process
-    if wanted in ("", found):
+    actual, expected = _name(certificate), identity.process
+    if expected in ("", actual):
         return None  # otherwise access control would drop everything that this process sends
-    return f"{identity.tls}: the certificate is for {found}; must be for {wanted}; give --tls the folder of that"
+    return f"{identity.tls}: the certificate is for {actual}; must be for {expected}; give --tls the folder of that"
 
 
 def own_name(identity: Identity) -> str:
@@ -111,10 +111,10 @@ def peer_fault(identity: Identity, endpoint: str) -> str | None:
 
     None if it succeeds, or if no process listens or answers yet.
     """
-    place = _ENDPOINT.fullmatch(endpoint)
-    if identity.tls is None or place is None:
+    match = _ENDPOINT.fullmatch(endpoint)
+    if identity.tls is None or match is None:
         return None
-    host, address = place["host"], (place["host"], int(place["port"]))
+    host, address = match["host"], (match["host"], int(match["port"]))
     try:
         with (
             socket.create_connection(address, PROBE_S) as plain,
@@ -128,22 +128,22 @@ def peer_fault(identity: Identity, endpoint: str) -> str | None:
             return fault
     except ssl.SSLCertVerificationError as error:
         if error.verify_code in _UNRELATED:
-            return f"the listener's certificate is from another authority than ours; {MEND} and use one set"
+            return f"the listener's certificate is from another authority than ours; {REMEDY} and use one set"
         if error.verify_code not in _MISNAMED:
-            return f"the listener's certificate is refused ({error.verify_message}); {MEND}"
+            return f"the listener's certificate is refused ({error.verify_message}); {REMEDY}"
     except ssl.SSLError as error:
-        return _words(error, endpoint)
+        return _error_text(error, endpoint)
     except OSError:
         return None
     try:
         context = _client(identity)
         context.check_hostname = False
         with socket.create_connection(address, PROBE_S) as plain, context.wrap_socket(plain) as link:
-            there = (link.getpeercert() or {}).get("subjectAltName", ())
+            alt_names = (link.getpeercert() or {}).get("subjectAltName", ())
     except OSError:
         return None
-    found = ", ".join(str(name) for _, name in there) or "no address"
-    return f"the listener's certificate is for {found}; must be for {host}; {ADDRESS_MEND}"
+    names = ", ".join(str(name) for _, name in alt_names) or "no address"
+    return f"the listener's certificate is for {names}; must be for {host}; {ADDRESS_REMEDY}"
 
 
 def _client(identity: Identity) -> ssl.SSLContext:
@@ -155,15 +155,15 @@ def _client(identity: Identity) -> ssl.SSLContext:
     return context
 
 
-def _words(error: ssl.SSLError, endpoint: str) -> str | None:
+def _error_text(error: ssl.SSLError, endpoint: str) -> str | None:
     """Return the text of a handshake error; None if the next attempt may succeed."""
     reason = error.reason or ""
     if "EXPIRED" in reason:
         return f"our certificate has expired by the listener's clock; {RENEW}"
     if "UNKNOWN_CA" in reason or "DECRYPT_ERROR" in reason:
-        return f"our certificate is from another authority than the listener's; {MEND} and use one set"
+        return f"our certificate is from another authority than the listener's; {REMEDY} and use one set"
     if "ALERT" in reason:
-        return f"the listener refuses our certificate ({_reason(error)}); {MEND}"
+        return f"the listener refuses our certificate ({_reason(error)}); {REMEDY}"
     if "WRONG_VERSION" in reason or "RECORD_LAYER" in reason or "HTTP" in reason:
         return f"the listener has no TLS; start it with --tls, or use tcp/ instead of {endpoint.split('/')[0]}/"
     return None
@@ -178,13 +178,13 @@ def _date_fault(certificate: dict[str, Any]) -> str | None:
     """Return the fault of a certificate that has expired or is not yet valid; None if it is valid now."""
     if not certificate:
         return None
-    now_s, whose = time.time(), f"the certificate of {_name(certificate)}"
+    now_s, subject = time.time(), f"the certificate of {_name(certificate)}"
     begin_s, end_s = (ssl.cert_time_to_seconds(certificate[each]) for each in ("notBefore", "notAfter"))
     if now_s > end_s:
-        return f"{whose} expired on {time.strftime('%Y-%m-%d', time.gmtime(end_s))}; {RENEW}"
+        return f"{subject} expired on {time.strftime('%Y-%m-%d', time.gmtime(end_s))}; {RENEW}"
     if now_s < begin_s:
         since = time.strftime("%Y-%m-%d", time.gmtime(begin_s))
-        return f"{whose} is valid from {since}; set the clock of this host"
+        return f"{subject} is valid from {since}; set the clock of this host"
     return None
 
 
@@ -203,9 +203,9 @@ def _read_own(identity: Identity) -> dict[str, Any]:
     server_side.load_cert_chain(*identity.files[1:])
     client_side = _client(identity)
     client_side.check_hostname = False
-    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
-    server = server_side.wrap_bio(there, back, server_side=True)
-    client = client_side.wrap_bio(back, there)
+    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+    server = server_side.wrap_bio(to_server, to_client, server_side=True)
+    client = client_side.wrap_bio(to_client, to_server)
     for side in (client, server, client):
         with contextlib.suppress(ssl.SSLWantReadError):
             side.do_handshake()
@@ -257,10 +257,10 @@ def permissions_of(access: Mapping[str, Any], listener: str, process: str) -> Pe
     }
     if any(allowed.values()):
         return Permissions(listener, process, allowed)
-    named = (name for subject in access.get("subjects", ()) for name in subject.get("cert_common_names", ()))
-    return Permissions(listener, process, known=tuple(named))
+    names = (name for subject in access.get("subjects", ()) for name in subject.get("cert_common_names", ()))
+    return Permissions(listener, process, known=tuple(names))
 
 
 def _shown(names: Sequence[str]) -> str:
-    more = len(names) - SHOWN_MAX
-    return (", ".join(names[:SHOWN_MAX]) or "nothing") + (f" and {more} more" if more > 0 else "")
+    remainder = len(names) - SHOWN_MAX
+    return (", ".join(names[:SHOWN_MAX]) or "nothing") + (f" and {remainder} more" if remainder > 0 else "")

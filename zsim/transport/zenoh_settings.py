@@ -183,25 +183,27 @@ def host_launcher_files(roles: int, hosts: int) -> int:
     return SESSION_FILES + ROLE_FILES * roles + HOST_FILES * hosts
 
 
-def require_files(needed: int, what: str) -> None:
+def require_files(needed: int, purpose: str) -> None:
     """Raise the soft limit to the needed number of files; SessionError if the hard limit does not allow it.
 
-    `what` names the cause in the error, e.g. "12 processes".
+    `purpose` names the cause in the error, e.g. "12 processes".
     """
     allowed = allow_files(needed)
     if allowed is not None and allowed < needed:
-        raise SessionError(f"the limit of open files is {allowed}; must be {needed} for {what}: `ulimit -n {needed}`")
+        raise SessionError(
+            f"the limit of open files is {allowed}; must be {needed} for {purpose}: `ulimit -n {needed}`"
+        )
 
 
-def allow_files(wanted: int) -> int | None:
+def allow_files(count: int) -> int | None:
     """Raise the soft limit to the wanted number if the hard limit allows it; return the limit, None if unlimited."""
     if sys.platform == "win32":
         return None
     import resource
 
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft == resource.RLIM_INFINITY or soft >= wanted:
+    if soft == resource.RLIM_INFINITY or soft >= count:
         return None if soft == resource.RLIM_INFINITY else soft
-    soft = wanted if hard == resource.RLIM_INFINITY else min(hard, wanted)
+    soft = count if hard == resource.RLIM_INFINITY else min(hard, count)
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     return soft

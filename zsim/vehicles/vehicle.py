@@ -184,8 +184,8 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             raise ValueError(f"rotors has the names {', '.join(names)}; must be distinct")
         farthest = max(el.hypot(rotor.x_m, rotor.y_m) for rotor in self.rotors)
         if not math.isclose(self.arm_m, farthest, rel_tol=ARM_MISS_MAX):
-            what = f"arm_m is {self.arm_m:g}, but the farthest of the rotors is {farthest:.4g} m from the centre"
-            raise ValueError(f"{what}; must be the same: give both, and airframe and rotor_radius_m that fit")
+            fault = f"arm_m is {self.arm_m:g}, but the farthest of the rotors is {farthest:.4g} m from the centre"
+            raise ValueError(f"{fault}; must be the same: give both, and airframe and rotor_radius_m that fit")
         strengths = linear.singular_values(np.vstack([np.ones(count), allocation(self)]))
         if strengths[-1] < RANK_MIN * strengths[0]:
             raise ValueError(

@@ -23,7 +23,7 @@ from zsim.contract.run_messages import RUN_ENDED, Clock, ControlAnswer, Event, F
 from zsim.errors import RecordError
 from zsim.record import Completeness, RecordReader, RecordWriter, completeness, mcap_layout
 from zsim.record.completeness import GateGap
-from zsim.record.mcap_layout import places
+from zsim.record.mcap_layout import record_spans
 from zsim_agents import recorder
 from zsim_agents.recorder import Recorder
 
@@ -224,7 +224,7 @@ def died(path: Path, passed: list[Pair], cut: int = 0) -> None:
         for key, payload in passed:
             writer.add(key, payload, messages.encoding(key), messages.decode(key, payload).t_ns, 1)
     data = path.read_bytes()
-    end = next(place.start for place in places(data) if place.opcode == Opcode.DATA_END)
+    end = next(place.start for place in record_spans(data) if place.opcode == Opcode.DATA_END)
     path.write_bytes(data[: end - cut])
 
 

@@ -120,7 +120,7 @@ class GatePublication:
         sigmas_m = np.array(fleet.gps_sigma_m)
         self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, self.counts, rotors, own_messages)
         self._known: dict[str | None, int] = {None: COMMANDER}
-        self._words = framing.words((*firmware.MODES, None))
+        self._words = framing.text_table((*firmware.MODES, None))
         payloads = self._payloads()
         self._user_room = 2 * len(payloads.data)  # bytes of messages that are encoded in Python
         self._make_room(16 * fleet.count)
@@ -156,7 +156,7 @@ class GatePublication:
         """Return the number of the word for a commander, adding the word if it is new."""
         if commander not in self._known:
             self._known[commander] = COMMANDER + len(self._known)
-            self._words = framing.words((*firmware.MODES, *self._known))
+            self._words = framing.text_table((*firmware.MODES, *self._known))
             self._make_room(self._written.columns.shape[1])
         return self._known[commander]
 

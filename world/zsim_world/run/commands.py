@@ -17,7 +17,7 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Ardrone
 from zsim.contract.run_messages import PRIORITY_MAX, ControlRequest, Fault
 from zsim.contract.snapshot import Saved
-from zsim.runtime.links import NEVER, RADIO, WORLD, distance_between, drone_of, joins, place_of, total_delay_ns
+from zsim.runtime.links import NEVER, RADIO, WORLD, distance_between, drone_of, joins, position_of, total_delay_ns
 from zsim_world.fleet.fleet import ExternalDrones, Fleet
 from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.outbox import Refusal, too_many
@@ -128,7 +128,7 @@ class CommandIntake:
             return False
 
         def distance_m(fault: Fault) -> float | None:
-            position_m = place_of(sender, fault.parameters["place"], self._drones, self._position_m)
+            position_m = position_of(sender, fault.parameters["place"], self._drones, self._position_m)
             return distance_between(self._position_m(drone), position_m)
 
         return total_delay_ns(radios, self._scenario.seed, WORLD, key, command.message, distance_m) is NEVER

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from refused import refused
 
 from zsim.contract import flight_messages, keys, messages
-from zsim.contract.framing import BOOL, FLOATS, INT, TEXT, GateMessages, Layouts, key_table, read, words, write
+from zsim.contract.framing import BOOL, FLOATS, INT, TEXT, GateMessages, Layouts, key_table, read, text_table, write
 from zsim.errors import DecodeError
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
@@ -140,7 +140,7 @@ TEXTS = ["landed", "flying", "", "controller.main", "ö" * 15, None]
 
 def written(kinds: list[Any], rows: list[tuple[int, list[int], list[float]]]) -> list[bytes]:
     """Return the payloads written from (kind, whole numbers, floats), after checking that they can be read again."""
-    layouts, texts = Layouts(kinds), words(TEXTS)
+    layouts, texts = Layouts(kinds), text_table(TEXTS)
     found = []
     for kind, whole, real in rows:
         ints, floats = padded(whole, layouts.ints, np.int64), padded(real, layouts.floats, np.float64)

@@ -19,7 +19,7 @@ from zsim.contract.messages import DroneInfo, Info
 from zsim.contract.run_messages import Clock
 from zsim.record import Completeness, RecordReader, RecordWriter, completeness
 from zsim.record.completeness import UNREAD, GateGap, sequence_numbers
-from zsim.record.mcap_layout import places
+from zsim.record.mcap_layout import record_spans
 from zsim.record.record_reader import MessageSpans
 
 INFO = run_info(["d1"])
@@ -158,7 +158,7 @@ def test_a_damaged_or_truncated_record_is_incomplete(tmp_path: Path) -> None:
     path.write_bytes(data[:-9])
     with RecordReader(path) as reader:
         assert (completeness(reader).complete, completeness(reader).closed) == (False, False)
-    for place in (place for place in places(data) if place.opcode == Opcode.CHUNK):
+    for place in (place for place in record_spans(data) if place.opcode == Opcode.CHUNK):
         at = (place.start + place.end) // 2
         path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
         with RecordReader(path) as reader:

@@ -23,7 +23,7 @@ from zsim.contract.messages import Imu
 from zsim.contract.run_messages import Clock
 from zsim.errors import RecordError
 from zsim.record import Recorded, RecordReader, RecordWriter, repair
-from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, chunk_head, is_cut, places
+from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, chunk_head, is_cut, record_spans
 from zsim.record.record_reader import record_notes
 from zsim.record.record_writer import CHUNK_BYTES
 
@@ -170,7 +170,7 @@ class Damaged:
         self.path, self.recorded = folder / "run.mcap", flight(messages)
         self.sizes = write(self.path, self.recorded)
         self.data = bytearray(self.path.read_bytes())
-        self.chunks = [place for place in places(bytes(self.data)) if place.opcode == Opcode.CHUNK]
+        self.chunks = [place for place in record_spans(bytes(self.data)) if place.opcode == Opcode.CHUNK]
         self.third = self.sizes[2 * CHUNK_MESSAGES - 1]  # where the third chunk begins
 
     def read(self) -> tuple[list[Recorded], tuple[str, ...], bool]:
@@ -227,7 +227,7 @@ def test_an_impossible_length_hides_what_follows_and_is_reported(tmp_path):
 def test_a_length_beyond_the_end_of_a_truncated_file_counts_as_damage(tmp_path, bit):
     record = Damaged(tmp_path, 600)
     del record.data[-1000:]
-    after = next(place.start for place in places(bytes(record.data)) if place.start > record.third)
+    after = next(place.start for place in record_spans(bytes(record.data)) if place.start > record.third)
     for place in (record.third, after):
         record.data[place + 1 + bit // 8] ^= 1 << bit % 8
         found, damage, complete = record.read()
@@ -252,8 +252,8 @@ def test_bytes_after_the_last_record_are_a_truncated_one_or_damage(rest: bytes, 
 
 def test_only_a_closed_record_is_compared_with_its_checksum(tmp_path):
     record = Damaged(tmp_path)
-    (end,) = [place for place in places(bytes(record.data)) if place.opcode == Opcode.DATA_END]
-    record.data[next(places(bytes(record.data))).end - 1] ^= 1  # the last letter of the writer's name
+    (end,) = [place for place in record_spans(bytes(record.data)) if place.opcode == Opcode.DATA_END]
+    record.data[next(record_spans(bytes(record.data))).end - 1] ^= 1  # the last letter of the writer's name
     for data, differs in ((record.data, True), (record.data[: end.end], False)):
         record.path.write_bytes(data)
         with RecordReader(record.path) as reader:
@@ -278,7 +278,7 @@ def test_a_chunk_with_a_damaged_header_is_skipped_and_not_summarised(tmp_path):
 @pytest.mark.parametrize("opcode", [Opcode.SCHEMA, Opcode.CHANNEL])
 def test_a_damaged_schema_or_channel_is_reported_in_one_line(tmp_path, opcode):
     record = Damaged(tmp_path, 100)
-    place = next(place for place in places(bytes(record.data)) if place.opcode == opcode)
+    place = next(place for place in record_spans(bytes(record.data)) if place.opcode == opcode)
     at = place.body + (2 if opcode == Opcode.SCHEMA else 4)  # the length of its name
     record.data[at : at + 4] = b"\xff\xff\xff\x7f"
     record.path.write_bytes(record.data[:-1])  # truncated, so that there is something to repair

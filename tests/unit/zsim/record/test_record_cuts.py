@@ -28,7 +28,7 @@ from zsim.record.mcap_layout import (
     RecordSpan,
     content_of,
     opening,
-    places,
+    record_spans,
 )
 from zsim_analysis.export import Format
 from zsim_analysis.export.columns import MessageSelection
@@ -72,15 +72,15 @@ def test_the_record_has_every_kind_of_message(run: Path) -> None:
 
 
 def chunks(data: bytes) -> list[RecordSpan]:
-    return [place for place in places(data) if place.opcode == Opcode.CHUNK]
+    return [place for place in record_spans(data) if place.opcode == Opcode.CHUNK]
 
 
 def nasty(data: bytes) -> list[int]:
     """Return the critical places for a cut: in and around the magic, heads, chunks, indexes, summary and footer."""
     found = chunks(data)
     middle, last = found[len(found) // 2], found[-1]
-    indexes = [place for place in places(data) if place.opcode == Opcode.MESSAGE_INDEX]
-    ends = {place.opcode: place for place in places(data)}
+    indexes = [place for place in record_spans(data) if place.opcode == Opcode.MESSAGE_INDEX]
+    ends = {place.opcode: place for place in record_spans(data)}
     at = [0, 1, len(MAGIC) - 1, len(MAGIC), len(MAGIC) + 1, len(MAGIC) + HEAD.size, found[0].start]
     for chunk in (found[0], middle, last):
         at += [chunk.start, chunk.start + 1, chunk.body, chunk.body + CHUNK_HEAD.size - 2, chunk.body + CHUNK_HEAD.size]

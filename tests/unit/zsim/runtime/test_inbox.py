@@ -79,7 +79,7 @@ def test_any_order_of_arrival_gives_the_canonical_sequence(seed: int, gates: int
     rng.shuffle(arrivals)
     inbox = Inbox([keys.status("d1"), keys.status("d2")], ["d1", "d2"])
     assert feed(inbox, [*messages_sent[0], *arrivals]) == expected(messages_sent)
-    assert inbox.duplicates + inbox.late == again
+    assert inbox.duplicates + inbox.late_count == again
 
 
 @settings(max_examples=100, deadline=None)
@@ -138,7 +138,7 @@ def test_a_replay_fills_a_gap_without_duplicates():
     assert inbox.next_gate_ns() == 2 * GATE_NS
     taken += feed(inbox, [sent for gate in messages_sent[1:] for sent in gate])
     assert taken == expected(messages_sent)
-    assert inbox.late == len(messages_sent[1]) + len(messages_sent[5])
+    assert inbox.late_count == len(messages_sent[1]) + len(messages_sent[5])
     assert inbox.duplicates == 2
 
 
@@ -234,7 +234,7 @@ def test_duplicate_and_late_messages_are_counted_and_refused():
     assert inbox.duplicates == 1
     inbox.take(0)
     assert not inbox.put(*messages_sent[0])
-    assert inbox.late == 1
+    assert inbox.late_count == 1
     assert inbox.next_gate_ns() is None
 
 
@@ -269,7 +269,7 @@ def test_a_late_message_comes_once_with_the_next_gate_in_realtime():
     assert not inbox.put(b, estimate(2 * GATE_NS, 2))
     assert not inbox.put(b, estimate(GATE_NS, 1))
     assert [(key, message.seq) for key, message in inbox.take(4 * GATE_NS)] == [(a, 4)]
-    assert inbox.late == 4
+    assert inbox.late_count == 4
 
 
 def test_late_messages_outside_gates_come_with_the_next_gate_in_lockstep():

@@ -17,7 +17,7 @@ from zsim.contract.messages import AgentMessage, ClusterInfo, Imu, Info, encode,
 from zsim.contract.run_messages import ControlRequest, Fault, Faults, RadioLinks
 from zsim.contract.snapshot import pack, unpack
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.links import Links, Receiver, Transmitter, place_of, senders
+from zsim.runtime.links import Links, Receiver, Transmitter, position_of, senders
 from zsim.scenario import scenario_file
 from zsim.scenario.faults import planned
 from zsim.scenario.scenario import Radio
@@ -219,15 +219,15 @@ def test_there_is_no_radio_between_a_drone_and_its_own_estimator():
 
 def test_a_radio_at_an_unknown_place_loses_nothing():
     assert len(gates(links(radio()), 5, status)) == 5  # no estimate has arrived yet
-    assert place_of("controller.main", {"controller.main": "d9"}, ("d1",), {}.get) is None
+    assert position_of("controller.main", {"controller.main": "d9"}, ("d1",), {}.get) is None
 
 
 @pytest.mark.parametrize("process", ["estimator.d2", "reference.d2", "pilot.d2"])
 def test_a_process_named_after_a_drone_has_its_radio_on_that_drone(process: str) -> None:
     """d1 is 1000 m from the origin and beside d2; d2 hears itself wherever it is."""
     far, place = (1000.0, 0.0, 0.0), {"d2": (1000.0, 1.0, 0.0)}.get
-    assert place_of(process, {}, ("d1", "d2"), place) == (1000.0, 1.0, 0.0)
-    assert place_of(process, {process: [5, 0, 0]}, ("d1", "d2"), place) == [5, 0, 0]
+    assert position_of(process, {}, ("d1", "d2"), place) == (1000.0, 1.0, 0.0)
+    assert position_of(process, {process: [5, 0, 0]}, ("d1", "d2"), place) == [5, 0, 0]
     made = links(fault("radio", "world", range_m=50, spread_m=5), names=(process,))
     for gate in (1, 2, 3):
         handed = made.delivered(gate * GATE_NS, [estimate(gate, far), estimate(gate, far, drone="d2")])
@@ -239,7 +239,7 @@ def test_a_process_named_after_a_drone_has_its_radio_on_that_drone(process: str)
 
 @pytest.mark.parametrize("process", ["controller.d2", "camera.d2", "console.1", "pilot.nobody"])
 def test_a_process_that_is_on_no_drone_is_at_the_origin(process: str) -> None:
-    assert place_of(process, {}, ("d1", "d2"), {"d2": (1000.0, 1.0, 0.0)}.get) == ZEROS
+    assert position_of(process, {}, ("d1", "d2"), {"d2": (1000.0, 1.0, 0.0)}.get) == ZEROS
 
 
 def world() -> World:
