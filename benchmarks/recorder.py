@@ -138,7 +138,7 @@ def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
 
 
 def _cut_short(ends_ns: Mapping[str, int], last_ns: int) -> dict[str, str]:
-    """Return as faults the drones' periodic keys that end over SLOWEST_S before the run: a loss without gap in `seq`."""
+    """Return as faults the drones' periodic keys that end over SLOWEST_S before the run, which `seq` does not show."""
     early = {key: (last_ns - end_ns) / 1e9 for key, end_ns in ends_ns.items() if key.startswith("drone/")}
     of_a_rate = {key: by_s for key, by_s in early.items() if "/sensor/" in key or key.endswith(("/truth", "/estimate"))}
     return {key: f"ends {by_s:g} s before the run" for key, by_s in of_a_rate.items() if by_s > SLOWEST_S}

@@ -46,7 +46,7 @@ PLAN, TABLE, SCENARIO, VIOLATION = "hunt.json", "flights.csv", "violation.yaml",
 BUNDLE = "violation.zsim"
 OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, BUNDLE, "summary.json", "report.html", "figures", ".lock")
 SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages besides those of `shrink`
-SAME_BITS = "same_bits"  # quantity: whether truth is bit-identical to that of the same flight with no process dying
+SAME_BITS = "same_bits"  # quantity: whether truth is bit-identical to that of the same flight in which no process dies
 MISSES_MAX = 100  # successive draws that cannot be flown, after which --vary is deemed wrong; design choice
 DECIMALS = 6  # decimals of margins in the table
 
@@ -64,7 +64,7 @@ class HuntRequest(Struct, frozen=True):
     seed: int = 1  # seed of the draws
     flights: int | None = None
     budget_s: float | None = None
-    faults: tuple[str, ...] = ()  # texts of `--fault`; empty: all kinds
+    faults: tuple[str, ...] = ()  # texts of `--fault`; empty: all kinds except deaths of processes
     without: tuple[str, ...] = ()  # kinds of faults that are not drawn
     vary: tuple[str, ...] = (WIND,)
     changed: tuple[str, ...] = ()  # overrides `a.b.c=value` already applied to the document
@@ -117,7 +117,7 @@ class Violation(Struct, frozen=True):
     number: int  # number of the flight in which it was found
     found: Case
     shrunk: Case
-    margin: float | None  # margin of the shrunk flight; None if a quantity is unknown
+    margin: float | None  # margin of the flight recorded or else found; None if unknown or the flight failed
     unknown: str  # the unknown quantity, or why the flight failed
     causes: list[CauseFound]
     options: list[str]  # options with which `zsim run` of the scenario flies the shrunk flight
@@ -163,7 +163,8 @@ def hunt(request: HuntRequest) -> Hunted:
 
     Raises:
         ScenarioError: a requirement, a fault, a field or the scenario is wrong; one line for each.
-        RunError: the folder holds something else or cannot be written, or workers cannot start.
+        RunError: the folder holds another hunt or other files, is in use or cannot be made, or workers cannot start.
+        ReportError: the folder cannot be written.
     """
     texts, document = _with_functions(request.requirements, request.document)
     requirements = _requirements(texts)
@@ -214,7 +215,7 @@ _requirement = lru_cache(maxsize=64)(Requirement)
 def judge_flight(requirements: Sequence[str], twin: Scenario | None, summary: RunSummary, row: Row) -> dict[str, Any]:
     """Return the margins of a flight, or why they cannot be computed; called in the process that flew it.
 
-    `twin` is the same flight with no process dying, with which it is compared bit by bit; None if no process dies.
+    `twin` is the same flight without deaths of processes, flown for SAME_BITS; None if the flight has none.
     """
     columns = {name: row[name] for name in row if name in FIXED or name.startswith((METRIC, "clusters."))}
     quantities = {**columns, **dict(quantities_of(msgspec.to_builtins(summary)))}
