@@ -173,7 +173,7 @@ class Separations(NamedTuple):
 
 
 def distances(flight: RecordedFlight, pairs_max: int) -> Distances | None:
-    """Return the distances between simulated drones, by pair if at most `pairs_max`; None without two drones or common times."""
+    """Return the distances between simulated drones, by pair if at most `pairs_max`; None if there are none."""
     tracks = [track for track in flight.tracks if len(track.t_ns) and not track.external]
     t_ns, indices = common_instants(tracks)
     if len(tracks) < 2 or not len(t_ns):

@@ -25,7 +25,7 @@ from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, engaged_column
 Samples = NDArray[np.float64]
 
 LEVEL = 0.95  # confidence level of all intervals
-RUNS_MIN = 5  # minimum number of runs for an interval; design choice: for 2, 13 times their difference
+RUNS_MIN = 5  # minimum number of runs for an interval; design choice: with 2, it is 13 times their difference
 SEPARATION = "min_separation_m"
 OBSTACLE_DISTANCE = "min_obstacle_distance_m"
 _NUMBER = re.compile(r"(?<![\w.])\d[\d.]*")  # a number in a text, but not in a name such as drone1
@@ -43,7 +43,7 @@ class ConfidenceInterval(Struct, frozen=True):
 def mean_interval(samples: Samples) -> ConfidenceInterval:
     """Return the mean of samples (n,) with Student's interval, mean ± t(n − 1) s / √n; NaN limits if n < RUNS_MIN.
 
-    The interval is exact for normally distributed samples, and asymptotically correct for others by the central limit theorem.
+    The interval is exact for normally distributed samples, and asymptotically correct for others (central limit theorem).
     """
     n = len(samples)
     middle = float(np.mean(samples)) if n else math.nan
