@@ -86,7 +86,7 @@ class Engagement:
         law: Callable[[ClusterSpace, FormationGains], ControlLaw] = ProportionalLaw,
     ) -> None:
         if len(drones) != space.n:
-            raise ValueError(f"cluster: {len(drones)} drones; allowed: {space.n}, as its cluster space has")
+            raise ValueError(f"cluster: {len(drones)} drones; allowed: {space.n}, one per robot of its cluster space")
         self.space = space
         self.drones = tuple(drones)
         self.gains = gains or FormationGains()
@@ -131,7 +131,7 @@ class Engagement:
             return self._climb(gate)
         if self._phase != "landing":
             return self._output(gate, "")
-        # a take-off command may still be in transit: idle only after some time on the ground
+        # a take-off command may still be in transit: idle only some time after the request to land
         if gate.is_down and gate.t_s - self._landing_s >= RESEND_S:
             self._phase = "idle"
         modes = self._mode_commands(gate, "land", AIRBORNE | {"taking_off"})
@@ -202,7 +202,7 @@ class Engagement:
 
     def _submit(self, request: FlightRequest) -> str | None:
         if self._gate is None:
-            return "no gate was seen yet; ask again when the simulation runs"
+            return "no gate has been seen yet; ask again when the simulation runs"
         try:
             self._grant(request, self._gate)
         except REFUSALS as refusal:

@@ -133,6 +133,7 @@ class VehicleServer(ABC):
 
         Raises:
             RunError: the run has no pace, or a port or an address is unavailable.
+            NoWorldError: the world does not answer, usually because it has ended.
         """
         set_pace(link, info, observer.name, options.rate)
         asyncio.run(cls(link, info, observer, say, options).run(stopped))
