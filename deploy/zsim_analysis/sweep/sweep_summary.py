@@ -43,7 +43,7 @@ class ConfidenceInterval(Struct, frozen=True):
 def mean_interval(samples: Samples) -> ConfidenceInterval:
     """Return the mean of samples (n,) with Student's interval, mean ± t(n − 1) s / √n; NaN limits if n < RUNS_MIN.
 
-    The interval is exact for normally distributed samples, and asymptotically correct for others (central limit theorem).
+    The interval is exact for normally distributed samples, and for others asymptotically (central limit theorem).
     """
     n = len(samples)
     middle = float(np.mean(samples)) if n else math.nan
