@@ -117,7 +117,7 @@ class Violation(Struct, frozen=True):
     number: int  # number of the flight in which it was found
     found: Case
     shrunk: Case
-    margin: float | None  # margin of the flight recorded or else found; None if unknown or the flight failed
+    margin: float | None  # margin of the recorded flight, or else of the one found; None if it is unknown
     unknown: str  # the unknown quantity, or why the flight failed
     causes: list[CauseFound]
     options: list[str]  # options with which `zsim run` of the scenario flies the shrunk flight

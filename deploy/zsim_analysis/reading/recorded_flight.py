@@ -209,7 +209,7 @@ class RecordedFlight:
     estimates: dict[str, DroneEstimates] = field(default_factory=dict)
     commands: dict[str, VelocityCommands] = field(default_factory=dict)
     others: dict[str, int] = field(default_factory=dict)  # in process: number of messages by key that no report reads
-    cpu_s: float | None = None  # CPU time from the first gate to the last of a flight in a process of its own
+    cpu_s: float | None = None  # CPU time of this process from the first gate to the last; None for a record
     radio: RadioHistory | None = None  # None if the scenario has no radio
     references: dict[str, DroneReferences] = field(default_factory=dict)  # of drones that fly on their own, by drone
 

@@ -352,7 +352,7 @@ def _cluster_shortfalls(
     if "engaged" not in states.phases:
         phase = states.phases[-1]
         if takeoff_s is None:
-            yield _line(states, "window", 0.0, "never engaged; its plan has no take-off")
+            yield _line(states, "window", 0.0, "never engaged; it has no planned take-off")
         elif takeoff_s >= end_s:
             yield _line(states, "early", end_s, f"the run ended before its take-off at {seconds_text(takeoff_s)} s")
         elif end_s - takeoff_s < ENGAGES_S:

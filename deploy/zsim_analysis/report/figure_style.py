@@ -290,7 +290,7 @@ def _faults(flight: RecordedFlight) -> Iterator[Band]:
 
 
 def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
-    """Yield the times at which others than the scenario's agents flew a drone, from acquisition or first command."""
+    """Yield the flights of drones by processes other than the scenario's agents, from acquisition or first command."""
     since_ns: dict[str, int] = {}
     planned = {"controller", PILOT, *(flight.scenario.own_agents if flight.scenario else ())}
     for event in flight.events:

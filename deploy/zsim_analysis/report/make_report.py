@@ -135,7 +135,7 @@ def planned_figures(
         yield PlannedFigure(
             "distances.png",
             "Distances between drones",
-            f"True distance of {pairing}; horizontal lines: limits of the controllers, and contact of hulls.",
+            f"True distance of {pairing}; lines: the controllers' guard and alarm, and contact of two hulls.",
             partial(draw_distances, separation, separations(flight), colours, marks),
         )
     if tracking_errors := reference_errors(flight):

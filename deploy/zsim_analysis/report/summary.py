@@ -178,7 +178,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
     ended = str(end.get("reason", "ended"))
     if not flight.end:  # a record without an end event does not show which process died
         end_text, is_cut = f"{flight.last_ns / 1e9:.2f} s", not flight.completeness.closed
-        ended = f"the record {'was cut after' if is_cut else 'ends here at'} {end_text}: it has no end event"
+        ended = f"the record {'was cut after' if is_cut else 'ends at'} {end_text}: it has no end event"
     lines: list[EventLine] = []
     kept_counts, omitted = Counter[str](), Counter[str]()
     for event in flight.events:
