@@ -56,14 +56,8 @@ SETPOINT_NS = 40_000_000  # 25 Hz; PX4 treats setpoints at less than 2 Hz as los
 CHANGE_INTERVAL_NS = 15_000_000  # minimum spacing of changed setpoints; below the gate period (one setpoint each)
 STREAM_DURATION_NS = 600_000_000  # PX4 requires more than 0.5 s of setpoints before OFFBOARD
 VELOCITY_AND_YAW_RATE = 0xFFF & ~(TypeMask.VX | TypeMask.VY | TypeMask.VZ | TypeMask.FORCE | TypeMask.YAW_RATE)
-NO_POSITION = (
-    0.0,
-    0.0,
-    0.0,
-    math.nan,
-    math.nan,
-    math.nan,
-)  # first six parameters of NAV_LAND and NAV_TAKEOFF: no position given
+# First six parameters of NAV_LAND and NAV_TAKEOFF: no position given
+NO_POSITION = (0.0, 0.0, 0.0, math.nan, math.nan, math.nan)
 _RATES_HZ: dict[type, float] = {
     dialect.AttitudeQuaternion: 50,
     dialect.LocalPositionNed: 50,

@@ -47,7 +47,7 @@ class Ros1Node:
         host: name or address at which other nodes reach this host.
 
     Attributes:
-        shutdown_reason: who asked this node to stop, and why; empty until then.
+        shutdown_reason: why this node must stop; empty until then.
     """
 
     def __init__(self, name: str, master_uri: str, host: str, say: Say) -> None:

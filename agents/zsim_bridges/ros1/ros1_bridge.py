@@ -54,7 +54,7 @@ Navdata = message_class("ardrone_autonomy/Navdata")
 
 
 class NodeShutdownError(RunError):
-    """A ROS node, or the master, has asked this node to stop."""
+    """A ROS node or the master has asked this node to stop, or another node has taken its name."""
 
 
 def serve(
@@ -73,7 +73,7 @@ def serve(
         host: name or address at which ROS nodes reach this host.
 
     Raises:
-        NodeShutdownError: ROS asked this node to stop.
+        NodeShutdownError: ROS asked this node to stop, or another node took its name.
         RunError: two drones have the same name in ROS.
     """
     drone_link.warm_up()

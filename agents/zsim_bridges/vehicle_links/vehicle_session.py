@@ -128,7 +128,7 @@ class Failsafe:
 
     Attributes:
         armed: whether commands are obeyed.
-        commander: source of the last setpoint.
+        commander: source of the last setpoint; None once the world or a landing has ended its control.
         reason: why the aircraft last left the commander's control; empty for never.
     """
 

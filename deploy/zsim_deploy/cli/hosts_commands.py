@@ -222,7 +222,7 @@ def ps(
     federation: Annotated[str, Option(help="Only runs of this federation.")] = ALL_FEDERATIONS,
     as_json: Annotated[bool, Option("--json", help="Print JSON, one line per run.")] = False,
 ) -> None:
-    """Show the processes of the runs on this machine: role, host, pid, state, lag, age, messages/s, restarts.
+    """Show the processes of runs on this machine: role, host, pid, state, lag, age, messages/s, round trip, restarts.
 
     A narrow terminal shows fewer columns; --json prints all of them.
     """
