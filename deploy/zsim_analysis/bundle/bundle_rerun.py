@@ -53,7 +53,7 @@ def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
             raise RunError(f"{path}: has no {names.RECORD} with commands; omit --commands-only")
         else:
             if manifest.zsim != __version__:
-                note(f"flown by zsim {manifest.zsim}, flown again by {__version__}: results may differ in bits")
+                note(f"flown by zsim {manifest.zsim}, flown again by {__version__}: the same bits are not guaranteed")
             fault = _fly_again(manifest, folder, scenario, say)
         if fault:
             _note_machines(manifest, note)

@@ -62,7 +62,8 @@ def sweep(request: SweepRequest) -> list[Row]:
     """Fly the runs that are missing from the folder; return the rows of all finished runs.
 
     Raises:
-        RunError: the folder holds something else or cannot be written, or workers cannot start.
+        RunError: the folder holds something else, is in use or cannot be written, or workers cannot start.
+        ReportError: the table cannot be read or written.
         KeyboardInterrupt: on Ctrl-C, with the finished runs in the table.
     """
     plan = request.plan
