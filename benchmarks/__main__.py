@@ -1,4 +1,4 @@
-"""Measure the parts of the benchmarks, and write the results to benchmarks/README.md.
+"""Measure the parts of the benchmarks; write the results to benchmarks/results and benchmarks/README.md.
 
 make bench                                        all parts; creates the peers' environment first
 .venv/bin/python -m benchmarks a b --repeats 7    some parts

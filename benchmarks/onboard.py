@@ -1,7 +1,7 @@
 """Disk, memory and CPU needs of an estimator installed alone, as on an onboard computer, with and without numba.
 
 Each variant is installed from this project into an environment of its own in .venv-bench, and estimates the state of
-one drone of a world that runs unpaced in zsim's own environment.
+the only drone of a world that runs unpaced in zsim's own environment.
 """
 
 import subprocess

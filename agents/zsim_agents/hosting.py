@@ -266,5 +266,5 @@ def own_agent(
 
 
 def agent_class(role: str) -> Callable[..., Agent]:
-    """Return the class of a role's agents; its module is imported only now, since hosts of other roles do without."""
+    """Return the class of a role's agents; its module is imported only now, as hosts of other roles do not need it."""
     return plugin.load(AGENTS[role].agent, role, Agent)

@@ -116,9 +116,7 @@ class Recorder:
         try:
             if self._writer.has_former:
                 self._resume()
-                self._print(
-                    f"{NAME}: goes on with {self._writer.path} after t = {self._participant.now_ns / 1e9:.2f} s"
-                )
+                self._print(f"{NAME}: continues {self._writer.path} after t = {self._participant.now_ns / 1e9:.2f} s")
             else:  # a replay may no longer contain these last values
                 lasting = {keys.INFO: messages.encode(self._info)}
                 for key in (keys.INFO, keys.FAULTS, keys.camera_info("*", "*")):

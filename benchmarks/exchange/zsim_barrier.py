@@ -1,4 +1,4 @@
-"""zsim's own lockstep with nothing to compute: the real world, barrier, hub and runner over Zenoh.
+"""zsim's own lockstep with nothing to compute: the real world, barrier, history and runner over Zenoh.
 
 Included: WorldProcess, World, Barrier and MessageHistory, which build, encode, hash, put and keep truth, status and
 clock of every gate; in every agent, Runner, Inbox and AgentParticipant, which decode the status and encode and put the

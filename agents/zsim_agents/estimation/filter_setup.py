@@ -52,8 +52,8 @@ from zsim_agents.estimation.strapdown import (
 Array = NDArray[np.float64]
 
 LINK_LATENCY_S = 0.4  # s; design choice: latency that a radio and sparse telemetry add for an external drone
-LEVELLING_S = 60.0  # s; long against manoeuvres of seconds, short against the gyroscope's drift
-CLONE_EVERY_S = 0.1  # s; design choice: process noise over half this interval is small against any sensor's noise
+LEVELLING_S = 60.0  # s; long compared with manoeuvres of seconds, short compared with the drift of the gyroscope
+CLONE_EVERY_S = 0.1  # s; design choice: process noise over half of it is small compared with any sensor's noise
 CLONE_SHARE_MIN = 0.01  # of a reading's variance; design choice: less process noise since its sampling is negligible
 COMPASS_SIGMA_RAD = 2.0 * SET_DOWN_SIGMA_RAD  # rad; design choice: noisier readings do not initialise the heading
 ROOF_DISTANCE_MAX_M = 0.01  # m; design choice: a drone that starts this close to an obstacle stands on it

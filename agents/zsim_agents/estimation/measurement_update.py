@@ -273,7 +273,7 @@ def write_variance(reading: Array, setting: Array, variance: Array, at: int) -> 
 
 @inlined
 def is_refuted(rows: Rows, i: int, kind: int) -> bool:
-    """Return whether a drone that lately saw drone i, or was seen by it, trusts its own sensor: then drone i's errs."""
+    """Return whether a drone that recently saw drone i, or was seen by it, trusts its sensor: then drone i's errs."""
     for j in range(rows.sighted.shape[0]):
         last_s = max(rows.sighted[i, j], rows.sighted[j, i])
         is_trusted = math.isnan(rows.nominal[j, NOMINAL.refused_since + kind]) and rows.counts[j, COUNT.used + kind] > 0

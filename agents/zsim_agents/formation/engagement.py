@@ -212,7 +212,7 @@ class Engagement:
     def _grant(self, request: FlightRequest, gate: GateInput) -> None:
         if request is Order.TAKE_OFF:
             if self._phase != "idle":
-                raise RefusalError(f"phase is {self.phase}; take-off is possible when idle")
+                raise RefusalError(f"phase is {self.phase}; must be idle to take off")
             if fault := self.check.take_off_fault(gate, self.plan.assembles):
                 raise RefusalError(fault)
             self._phase = "taking_off"
@@ -226,7 +226,7 @@ class Engagement:
             self._modes_sent_s.clear()
         elif request is Order.REJOIN:
             if self._phase != "engaged" or not self._fault:
-                raise RefusalError(f"phase is {self.phase}; possible when held by a fault")
+                raise RefusalError(f"phase is {self.phase}; must be held by a fault")
             if fault := self._control_fault(gate):
                 raise RefusalError(fault)
             c = self._checked if self._checked.size else self.guidance.value(gate.t_s)[0]
@@ -238,7 +238,7 @@ class Engagement:
         elif isinstance(request, Assemble):
             self._grant_assembly(request, gate)
         elif self._phase != "engaged":
-            raise RefusalError(f"phase is {self.phase}; possible when engaged")
+            raise RefusalError(f"phase is {self.phase}; must be engaged")
         elif self._fault:
             raise RefusalError(self._fault)
         elif isinstance(request, Order):
@@ -253,7 +253,7 @@ class Engagement:
             self.guidance.resume(gate.t_s)
             return
         if self._phase != "assembling":
-            raise RefusalError(f"phase is {self.phase}; possible when assembling, or when held on request")
+            raise RefusalError(f"phase is {self.phase}; must be assembling, or held on request")
         if fault := self._arrival_fault(gate) or self.check.engagement_fault(gate):
             raise RefusalError(fault)
         if self._assembly is None:
@@ -268,7 +268,7 @@ class Engagement:
     def _grant_assembly(self, request: Assemble, gate: GateInput) -> None:
         """Assign the drones to the positions of a formation and start their flight there."""
         if self._phase not in ("assembling", "engaged") or self._fault:
-            raise RefusalError(self._fault or f"phase is {self.phase}; possible when assembling or engaged")
+            raise RefusalError(self._fault or f"phase is {self.phase}; must be assembling or engaged")
         if fault := self._arrival_fault(gate) or self.check.assembly_fault(gate):
             raise RefusalError(fault)
         if self._phase == "engaged":
@@ -357,7 +357,7 @@ class Engagement:
             try:
                 self.guidance.rejoin(self.check.value, gate.t_s)
             except REFUSALS as refusal:
-                self._fault, self._faultless_since_s = f"cannot go on: {refusal}", gate.t_s
+                self._fault, self._faultless_since_s = f"cannot continue: {refusal}", gate.t_s
             else:
                 self._fault, self._positions = "", None
                 self.law.reset()

@@ -37,7 +37,7 @@ TARGET_TEXTS = {
     "drone": "a drone",
     "world": "the world, hence all drones",
     "link": "the messages between two processes A/B; a drone's radio is affected by the kind radio",
-    "radio": "the radio between drones and others: the world's, or a formation's",
+    "radio": "the radio of all drones (target: world), or of a formation's drones",
     "process": "a process",
 }
 """Descriptions of the targets of faults."""

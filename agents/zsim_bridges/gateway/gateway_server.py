@@ -396,7 +396,7 @@ class Client:
 
     def _hello(self, request: client_messages.HelloRequest) -> None:
         if not self.authenticated and not self._gateway.is_token(request.token):
-            self.refuse("hello: no token, or a wrong one; the gateway's operator has it", request)
+            self.refuse("hello: no token, or a wrong one; ask the gateway's operator for it", request)
             return
         name = self._process_name(request.name) if request.name else self.source
         if not self.authenticated:
@@ -424,8 +424,8 @@ class Client:
         process = name if "." in name else f"{ROLE}.{name}"
         if not keys.PROCESS_NAME.fullmatch(process) or "." not in process.strip(".") or process == self._gateway.name:
             raise DecodeError(
-                f"name is {name[:60]!r}; must be NAME or ROLE.NAME of a-z 0-9 _ -, at most 48, e.g. myctrl or "
-                "matlab.main, and not the gateway's"
+                f"name is {name[:60]!r}; must be NAME or ROLE.NAME, at most 48 characters of a-z 0-9 _ -, "
+                "e.g. myctrl or matlab.main, and not the gateway's"
             )
         return process
 

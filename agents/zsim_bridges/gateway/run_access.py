@@ -193,7 +193,7 @@ class RunAccess:
         if names is not None and (messages.type_of(key) or is_control_key(key)) and thing not in names:
             raise UnknownError(f"{key[:80]}: {kind} is {thing[:40]!r}; must be one of {', '.join(names) or 'none'}")
         if kind == "estimates" and not keys.PROCESS_NAME.fullmatch(thing):
-            raise UnknownError(f"{key[:80]}: process is {thing[:60]!r}; must be 1 to 48 of a-z 0-9 _ . -")
+            raise UnknownError(f"{key[:80]}: process is {thing[:60]!r}; must be 1 to 48 characters of a-z 0-9 _ . -")
 
     def camera_key(self, drone: str, camera: str) -> str:
         """Return the key of a camera's pictures, or raise an UnknownError."""
