@@ -39,7 +39,7 @@ class Assertions(ABC):
             rms: largest allowed RMS of each cluster variable [m, rad], such as p=0.3.
 
         Raises:
-            AssertionError: an RMS is larger or unknown (one line for each, with the largest error and its time), the
+            AssertionError: an RMS is larger (one line for each, with the largest error and its time) or unknown, the
                 run ended before the window did, or the formation was not engaged throughout the window.
         """
         __tracebackhide__ = True  # pytest then shows the line of the test, not this function
@@ -53,7 +53,7 @@ class Assertions(ABC):
         if window[1] > run.duration_s:
             faults.append(f"{where}: the run ended at {run.duration_s:g} s")
         elif share != 1.0:
-            faults.append(f"{where}: was engaged {share or 0:.0%} of the time; must be all of it")
+            faults.append(f"{where}: was engaged for {share or 0:.0%} of the time; must be for all of it")
         for name, allowed in rms.items():
             error = errors_by_name[name].true_rms
             if error is None:
@@ -117,4 +117,4 @@ def _difference(own_run: "Run", other_run: "Run") -> str:
             comparison.add(a.t_ns, b.truth, a.truth)
             if comparison.first:
                 return f"truth is not the same: it first differs from the other run's for {comparison.first}"
-    return "truth on record is the same, but its hash is not: one of the records is not complete"
+    return "the recorded truth is the same, but its hash is not: one of the records is not complete"

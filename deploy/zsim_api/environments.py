@@ -3,8 +3,9 @@
     env = zsim.parallel_env("step.yaml", reward=near_start, terminated=zsim.flipped, observe="estimate", step_s=0.1)
     observations, infos = env.reset(seed=3)
 
-An episode begins when all drones are in the air, and ends with the scenario's duration. The effect of an action becomes
-visible after the command's delay (`infos[agent]["command_delay_s"]`), as everywhere in zsim: see docs/python.md.
+An episode begins when all drones are in the air; it ends with the scenario's duration, if it is not terminated before.
+The effect of an action becomes visible after the command's delay (`infos[agent]["command_delay_s"]`), as everywhere in
+zsim: see docs/python.md.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -50,7 +51,7 @@ def flipped(sim: Simulation, agent: str) -> bool:
 
 
 def far_away(distance_m: float) -> Ended:
-    """Return a condition that ends an agent's episode once one of its drones is farther than this from its start."""
+    """Return a condition that ends an agent's episode once one of its drones is `distance_m` away from its start."""
 
     def is_far(sim: Simulation, agent: str) -> bool:
         indices = [sim.names.index(drone) for drone in _drones(sim, agent)]
@@ -259,7 +260,7 @@ def gym_env(scenario: AnyScenario, **settings: Any) -> FlightEnv:
 def vector_env(
     scenario: AnyScenario, num_envs: int, processes: bool = False, **settings: Any
 ) -> VectorEnv[Any, Any, Any]:
-    """Return several Gymnasium environments as one; each begins its next episode at the step after its last one.
+    """Return several Gymnasium environments as one; each begins its next episode at the step after the end of the last.
 
     Args:
         scenario: as in `parallel_env`.

@@ -63,7 +63,7 @@ class Moment(NamedTuple):
     Attributes:
         t_s: simulated time [s].
         states: the newest received states of the clusters by name, which are two gates old.
-        truth: the true motion of the drones by name, except external ones.
+        truth: the true motion of the drones by name, except that of external ones.
         events: events since the last `wait_until`.
     """
 
@@ -85,9 +85,9 @@ class Federation(Assertions):
         seed, set, law, estimator, out: as in `zsim.run`; an earlier run in `out` is replaced.
         agents: your own agents, as in `zsim.run`, or as strings for `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
         programs: command lines of your own programs, in any language, each a string or a list of words. `{endpoint}`,
-            `{federation}` and `{folder}` are replaced, and the environment has ZSIM_CONNECT and ZSIM_FEDERATION.
+            `{federation}`, `{folder}` and `{name}` are replaced, and the environment has ZSIM_CONNECT, ZSIM_FEDERATION.
             Simulated time starts only once every program with a name ("ground.main=python ground.py") has joined.
-            A program that ends with a code other than 0 fails the flight.
+            A program that ends with a code other than 0 fails the flight, unless the test has killed it.
         options: further options of `zsim run`, such as "--hosted", or "--rate" and "1".
         modules: further folders with the modules of named classes, beside those of the scenario.
 
@@ -142,7 +142,7 @@ class Federation(Assertions):
         self._known_names = {*expected, WORLD, RECORDER}
         self._has_others = bool(agent_texts or options) or any(
             not name for name, _ in named_programs
-        )  # with unknown names
+        )  # processes whose names are unknown
         self._clock: Clock | None = None
         self._pids: dict[str, int] = {}
         self._killed: dict[int, str] = {}
@@ -194,7 +194,7 @@ class Federation(Assertions):
             The moment at which the condition was met.
 
         Raises:
-            RunError: there is no such phase or kind of event.
+            RunError: `what` is not a phase, a kind of event, a time or a function.
             RunFailedError: the run ended first, a program failed, or `within_s` has passed.
             Exception: raised by the function.
         """
@@ -246,12 +246,12 @@ class Federation(Assertions):
     # Interventions
 
     def ask(self, key: str, op: str, within_s: float = PATIENCE_S, **args: Any) -> Any:
-        """Send a request to the world or a controller, as `zsim ask` does.
+        """Send a request to the world, a controller or a pilot, as `zsim ask` does.
 
         For example, `ask("cluster/main/control", "target", values={…})`.
 
         Args:
-            key: `world/control` or `cluster/NAME/control`.
+            key: `world/control`, `cluster/NAME/control` or `drone/NAME/control`.
             op, args: the request, as in docs/protocol.md.
             within_s: wall time to wait for the world.
 
@@ -374,7 +374,7 @@ class Federation(Assertions):
     def diagnosis(self) -> str:
         """Return a text on the progress of the run, the processes that it waits for, and the last lines of the logs.
 
-        The logs of failed and awaited processes come first, then the launcher's; then one line of each other log.
+        The logs of failed and awaited processes come first, then the launcher's; then the last line of each other log.
         """
         clock = self._newest_clock()
         waiting = [each for each in clock.waiting_for if each.name != PROCESS] if clock else []
@@ -397,7 +397,7 @@ class Federation(Assertions):
 
     def _progress(self, clock: Clock | None, waiting: Sequence[Waiting]) -> str:
         if clock is None:
-            return "no clock message of a world was received"
+            return "no clock message from a world was received"
         lines = [f"  {each}" for each in holding_up(clock.state, waiting) or waiting]
         if not self._watch.has_left and self._watch.condition is None:
             lines.append(f"  {PROCESS}, this test, which is not waiting for anything at the moment")

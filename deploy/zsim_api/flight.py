@@ -204,7 +204,7 @@ def raise_failure(folder: Path, code: int) -> None:
 
 
 def _last_line(folder: Path, code: int | None) -> str:
-    """Return the last line that `zsim run` printed to its log."""
+    """Return the last line that `zsim run` printed to its log; without one, a text with its exit code."""
     log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
     lines = log.read_text(errors="replace").split("\n") if log.exists() else []
     return next((line for line in reversed(lines) if line.strip()), f"`zsim run` ended with code {code}")

@@ -194,7 +194,7 @@ def _tokens(pickled: bytes, files: set[str]) -> Iterator[str]:
     """Yield a pickle's content without files and the random identifiers of a process: the same for equal objects."""
     class_tokens: dict[str, str] = {}
     for opcode, arg, _ in pickletools.genops(pickled):
-        if not isinstance(arg, str):  # a frame's argument is its size in bytes; that of array content, a bytearray
+        if not isinstance(arg, str):  # a frame's argument is its size in bytes, that of an array's content a bytearray
             yield "" if opcode.name == "FRAME" else f"{arg!r}\n"
         elif arg in cloudpickle_parts._DYNAMIC_CLASS_TRACKER_BY_ID:
             yield class_tokens.setdefault(arg, f"class {len(class_tokens)}\n")

@@ -61,8 +61,8 @@ class Interface:
 
     An observation (K,) of "truth" or "estimate" holds, for each drone of the agent, position [m] and velocity
     [m/s] in W, orientation (w, x, y, z; B to W) and, for "truth", angular velocity in B [rad/s]; then, for each other
-    drone, position and velocity relative to the agent's first drone, in W. An observation of "sensors" holds the newest
-    sample of every sensor, in the order of the contract; 0 before the first one.
+    drone, position and velocity relative to the agent's first drone, in W. An observation of "sensors" holds the
+    floating-point fields of the newest sample of every sensor, in the order of the contract; 0 before the first one.
 
     An action (A,) has values from -1 to 1, scaled to the limits of the drone's firmware and rotors (see `bounds`). For
     each drone of the agent, these are, for "velocity": forward, left, up [m/s], yaw rate [rad/s]; for "attitude": roll,
@@ -236,7 +236,7 @@ class Interface:
 
 
 def _readings(drone: Drone) -> list[tuple[str, str, int]]:
-    """Return the sensor, field and width of every numeric field that a drone's sensors measure."""
+    """Return the sensor, field and width of every floating-point field that a drone's sensors measure."""
     readings = []
     for name, kind, settings in drone.sensors.sections():
         if getattr(settings, "rate_hz", 1.0) == 0:

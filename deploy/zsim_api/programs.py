@@ -7,10 +7,10 @@ keeper is this file, run by path:
     python -I -S programs.py GRACE_S WORD...
 
 Standard input of the keeper is a pipe from its caller, which closes when the caller ends: the program then receives
-SIGTERM, and is killed if it has not ended within the grace period. Signals to the keeper are forwarded to the program's
-process group, except SIGUSR1, which kills the program and its descendants. Descendants that outlive the program are
-killed after the same grace period. The exit code is the program's, 128 + N for a signal, as in shells, or 127 if the
-program cannot be started.
+SIGTERM, and is killed if it has not ended within the grace period. The keeper forwards SIGINT, SIGTERM and SIGHUP to
+the program's process group; SIGUSR1 kills the program and its descendants. Descendants that outlive the program are
+killed after the same grace period. (Killing works on Linux only.) The exit code is the program's, 128 + N for a signal,
+as in shells, or 127 if the program cannot be started.
 
 Only the standard library is imported here, so that a keeper starts within milliseconds.
 """

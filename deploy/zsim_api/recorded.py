@@ -89,7 +89,7 @@ class Run:
 
     Attributes:
         record: path of the file.
-        keys: number of messages on record by key.
+        keys: number of recorded messages by key.
         drones, clusters: names, in the order of the scenario.
     """
 
@@ -157,7 +157,7 @@ class Run:
         Messages of a program of your own have a column for each field.
 
         Args:
-            key: without the federation's name and without wildcards; `run.keys` lists the keys on record.
+            key: without the federation's name and without wildcards; `run.keys` lists the recorded keys.
 
         Raises:
             RunError: the record has no message of this key.
@@ -201,14 +201,14 @@ class Run:
         """Return estimate − truth of a drone over time: position in W and heading, the σ of each as stated by the
         estimator (`sigma_position_m_x`), and `nees`, which is 6 on average for a consistent estimator.
 
-        If there are more than 200 000 estimates in all, only every n-th is compared.
+        If there are more than 200 000 estimates in all, only those at every n-th gate are compared.
 
         Raises:
-            RunError: no such drone, or truth and estimate are not both on record.
+            RunError: no such drone, or the record lacks its truth or its estimates.
         """
         own = self._drone_errors.get(self._known("drone", drone, self.drones))
         if own is None:
-            raise RunError(f"{self.record}: truth and estimates of {drone} are not both on record")
+            raise RunError(f"{self.record}: does not contain both truth and estimates of {drone}")
         errors = dict(zip(ERROR_COLUMNS, own.error.T, strict=True))
         sigmas = {f"sigma_{name}": values for name, values in zip(ERROR_COLUMNS, own.sigma.T, strict=True)}
         return frame({INDEX: own.t_s, **errors, **sigmas, "nees": own.nees})
@@ -228,8 +228,8 @@ class Run:
             of: "formations" or "estimates".
 
         Raises:
-            RunError: the window's end is not after its start.
-            RecordError: there is no truth on record.
+            RunError: the window's end is not after its start, or `of` is unknown.
+            RecordError: the record contains no truth.
         """
         window = self.summary.window_s if window is None else _checked(window)
         if of == "estimates":
@@ -270,7 +270,7 @@ class Run:
     def scenario(self) -> Scenario:
         """The scenario with all defaults and overrides; it can be flown again.
 
-        Raises RunError if `world/info` is not on record.
+        Raises RunError if the record does not contain `world/info`.
         """
         if self._info is None:
             raise RunError(f"{self.record}: has no world/info, so its scenario is unknown")
@@ -282,7 +282,7 @@ class Run:
 
     @property
     def summary(self) -> RunSummary:
-        """The content of summary.json; raises RecordError if no truth is on record."""
+        """The content of summary.json; raises RecordError if the record contains no truth."""
         return self._assessment[2]
 
     @property
@@ -303,7 +303,7 @@ class Run:
 
     @property
     def complete(self) -> bool:
-        """Whether all messages of the world and the run's end are on record; `summary.record.state` names any gaps."""
+        """Whether all messages of the world and the run's end were recorded; `summary.record.state` names any gaps."""
         try:
             return self.summary.record.complete
         except RecordError:  # the record contains no truth
@@ -455,7 +455,7 @@ class Run:
         return name
 
     def _named(self, kind: str) -> list[str]:
-        """Return the drones or clusters that have messages on record."""
+        """Return the drones or clusters with recorded messages."""
         return list(dict.fromkeys(keys.thing(key) for key in self.keys if key.startswith(f"{kind}/")))
 
     def _cluster(self, name: str | None) -> str:
@@ -519,7 +519,7 @@ def _statistics(
 
 
 def _choices(name: str, names: Iterable[str]) -> str:
-    """Return a hint at the most similar name, and the available names."""
+    """Return a suggestion of the most similar name, and the available names."""
     names = list(names)
     omitted = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return f"{suggestion(name, names)}there are {', '.join(names[:SHOWN])}{omitted}" if names else "there are none"

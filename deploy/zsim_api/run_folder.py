@@ -65,8 +65,8 @@ def make_directory(out: Path | None, scenario: Scenario, force: bool = False) ->
 def locked(folder: Path) -> Iterator[Path]:
     """Yield a run's folder, locked until the block is left, so that no other run, even of this process, flies into it.
 
-    A run has no file that exists from the beginning, so the folder itself is locked. NFS cannot lock folders; there,
-    the locks of record and journal must suffice.
+    A run has no file that exists from the beginning, so the folder itself is locked. NFS and Windows cannot lock
+    folders; there, the locks of record and journal must suffice.
     """
     with file_fault(folder, "cannot be opened", OTHER_OUT):
         opened = None if os.name == "nt" else os.open(folder, os.O_RDONLY)
@@ -207,7 +207,7 @@ def left_only_if_flown(folder: Path) -> Iterator[None]:
 
 
 def launch_of(folder: Path) -> Launch:
-    """Return the launch of an interrupted run; raise RunError if the run is over, or the folder holds none."""
+    """Return the launch of an interrupted run; raise RunError if the folder contains no readable one."""
     path = folder / JOURNAL / LAUNCH
     try:
         return msgspec.convert(json.loads(path.read_bytes()), Launch)

@@ -50,7 +50,7 @@ class Scenario:
         """Return the scenario with other values.
 
         Args:
-            set: values by path, `{"drones.drone2.mass_kg": 0.5}`; where a class is named, the class itself will do.
+            set: values by path, `{"drones.drone2.mass_kg": 0.5}`; where a class is named, the class itself is accepted.
             fields: top-level fields.
 
         Raises:

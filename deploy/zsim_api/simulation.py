@@ -91,7 +91,7 @@ class Simulation:
 
     Raises:
         ScenarioError: with one line for every fault in the scenario.
-        RunError: the scenario cannot be flown in one process, or the folder of the record is not empty.
+        RunError, RecordError: the scenario cannot be flown in one process; the folder already contains a record.
 
     Attributes:
         names: names of the drones, in the order of all arrays.
@@ -228,7 +228,7 @@ class Simulation:
         return self.ended
 
     def ask(self, key: str, op: str, **args: Any) -> dict[str, Any]:
-        """Send a request to the world or a controller: `sim.ask("cluster/main/control", "target", values={…})`.
+        """Ask the world, a controller or a pilot: `sim.ask("cluster/main/control", "target", values={…})`.
 
         Equivalent to `zsim ask`; the request takes effect between this gate and the next.
 
@@ -391,7 +391,7 @@ class Sensors(Mapping[str, "Samples"]):
 class Samples:
     """The newest sample of one sensor of N drones: an attribute (N, …) for each field of its message, in its units.
 
-    For a drone without a sample, `t_sample_ns`, `t_ns` and `seq` are -1, and all other fields NaN.
+    For a drone without a sample, integer fields (`t_sample_ns`, `t_ns`, `seq`) are -1, and all other fields NaN.
     """
 
     def __init__(self, kind: type[Struct], drones: int) -> None:

@@ -17,7 +17,7 @@ from rich.console import Console
 from zsim.errors import RunError, ScenarioError, what_is_missing
 from zsim.output_folder import temporary_folder
 from zsim.runtime.progress import cell
-from zsim.scenario.scenario_file import whole_path
+from zsim.scenario.scenario_file import full_path
 from zsim.schema import plugin
 from zsim.schema.checker import show
 from zsim_analysis.reading.recorded_flight import RecordedFlight
@@ -124,7 +124,7 @@ def sweep(
     frame = _frame(read_table(folder / TABLE), design.varied)
     for path, values in vary.items():
         if labels := _labels(values, varied):
-            column = whole_path(path, plan.document)
+            column = full_path(path, plan.document)
             frame[column] = frame[column].replace(labels)
     frame.attrs = {"folder": str(folder), "summary": json.loads(indented_json(SweepResults(design, rows).summary()))}
     return frame

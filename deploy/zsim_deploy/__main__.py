@@ -12,7 +12,7 @@ GARBAGE_OBJECTS = 10_000  # threshold of the garbage collector; Python's 700 wou
 def main() -> None:
     """Load and run the command line."""
     gc.set_threshold(GARBAGE_OBJECTS)
-    takes_interrupts = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # or inherited as ignored
+    takes_interrupts = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # else inherited as ignored
     if takes_interrupts:
         signal.signal(signal.SIGINT, _leave)
     from zsim_deploy.roles.closed_output import renew_streams

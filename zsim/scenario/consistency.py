@@ -43,7 +43,7 @@ TEMPLATE_WIDTH_MIN_M = 0.1  # m, design choice: any real formation is wider; the
 WORLD_DEATHS = ("restart", "end")  # `on_death` of the world; no other process can continue the run
 LIFT_SHARE_MAX = 0.9  # maximum ratio of weight to the rotors' maximum lift; the rest is left for control
 TOP_COSINE, TOP_DEPTH_M = 0.999, 0.001  # minimum cosine of a flat top's slope; maximum depth of a drone in it
-UPON_COSINE = 0.5  # minimum cosine of a slope on which a drone may stand; design choice: beyond 60 deg it is a wall
+ON_TOP_COSINE = 0.5  # minimum cosine of a slope on which a drone may stand; design choice: beyond 60 deg it is a wall
 THRUST_SHARE_MIN = 0.005  # minimum weight / lift; design choice: racers that lift 15 times their weight have 0.07
 TILT_FREE_DEG = 30.0  # deg, tilt allowed to any drone that is light enough to fly
 # Design choice: a decade or more beyond real drones, which need 60 (large rotors) to 400 W/kg (racers) for 3 min to 2 h
@@ -55,7 +55,7 @@ TIP_MAX_M_S = 340.3  # m/s, speed of sound at 15 deg C, ISO 2533; propellers los
 AIR_M_S = 2.0
 # maximum ratio of inertia to mass_kg arm_m^2; design choice: it is 0.35 for the AR.Drone about z, 1 for bare rotors
 INERTIA_MAX_MR2 = 10.0
-LEAST_K1 = -4 / 27  # minimum of k1 tan^2(diagonal / 2); below it r + k1 r^3 peaks within the picture
+K1_MIN = -4 / 27  # minimum of k1 tan^2(diagonal / 2); below it r + k1 r^3 peaks within the picture
 RESERVED_ROLES = (OPERATOR, "agent", "python", "test")  # roles of zsim's own processes in addition to ROLES
 SIGHTED_MAX = 12  # maximum drones of a cluster with sightings: each estimator holds all states, at quadratic cost
 
@@ -110,17 +110,17 @@ def unflown_plans(scenario: Scenario) -> list[str]:
         trajectory_s = plan.trajectory.start_s if flies and plan.trajectory else None
         times = {"take-off": plan.takeoff_s, "trajectory": trajectory_s, "landing": plan.land_s}
         planned = {step: at_s for step, at_s in times.items() if at_s is not None}
-        late = [f"its {step} at {at_s:g} s" for step, at_s in planned.items() if at_s >= scenario.duration_s]
-        if late:
-            what = "none of it is flown" if "take-off" in late[0] or len(late) == len(planned) else "not flown"
-            line = f"the run ends at {scenario.duration_s:g} s, before {' and '.join(late)}: {what}"
+        missed = [f"its {step} at {at_s:g} s" for step, at_s in planned.items() if at_s >= scenario.duration_s]
+        if missed:
+            effect = "none of it is flown" if "take-off" in missed[0] or len(missed) == len(planned) else "not flown"
+            line = f"the run ends at {scenario.duration_s:g} s, before {' and '.join(missed)}: {effect}"
             lines.append(f"clusters[{index}].plan: {line} (cluster {cluster.name!r})")
-    for name, flown in scenario.piloted().items():
-        begins = [flown.takeoff_s, *([stage.start_s for stage in flown.stages] if isinstance(flown, Exchange) else [])]
-        begins += [flown.start_s] if isinstance(flown, DroneReference) and flown.start_s is not None else []
+    for name, ref in scenario.piloted().items():
+        begins = [ref.takeoff_s, *([stage.start_s for stage in ref.stages] if isinstance(ref, Exchange) else [])]
+        begins += [ref.start_s] if isinstance(ref, DroneReference) and ref.start_s is not None else []
         if max(begins) >= scenario.duration_s:
-            late = f"before its reference begins at {max(begins):g} s"
-            lines.append(f"drones.{name}: the run ends at {scenario.duration_s:g} s, {late}: not flown")
+            missed = f"before its reference begins at {max(begins):g} s"
+            lines.append(f"drones.{name}: the run ends at {scenario.duration_s:g} s, {missed}: not flown")
     return lines
 
 
@@ -176,18 +176,18 @@ def _start_faults(drones: _Entries, vehicles: Mapping[str, Vehicle]) -> Iterator
     placed = _placed(drones)
     positions = np.array([drone.position_m for _, drone in placed], dtype=float).reshape(-1, 3)
     clearance = np.array([_clearance_m(drone, vehicles) for _, drone in placed])
-    for place, (index, _) in enumerate(placed):
-        if positions[place, 2] < 0:
-            yield f"drones[{index}].position_m[2]", f"is {positions[place, 2]:g}; must be >= 0 (the ground)"
-        distances = np.linalg.norm(positions[:place] - positions[place], axis=1)
-        least = clearance[:place] + clearance[place]
-        if place and (distances < least).any():
-            worst = int((distances - least).argmin())
+    for k, (index, _) in enumerate(placed):
+        if positions[k, 2] < 0:
+            yield f"drones[{index}].position_m[2]", f"is {positions[k, 2]:g}; must be >= 0 (the ground)"
+        distances = np.linalg.norm(positions[:k] - positions[k], axis=1)
+        limits = clearance[:k] + clearance[k]
+        if k and (distances < limits).any():
+            worst = int((distances - limits).argmin())
             nearest, other = placed[worst]
             yield (
                 f"drones[{index}].position_m",
                 f"is {distances[worst]:.2f} m from {other.name or f'drones[{nearest}]'!r}; "
-                f"must be >= {least[worst]:g} m",
+                f"must be >= {limits[worst]:g} m",
             )
 
 
@@ -203,28 +203,28 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
         path = f"environment.obstacles[{index}]"
         if obstacle.name in names:
             yield f"{path}.name", f"is {obstacle.name!r}, as a drone; must be unique"
-        wanted = _SIZES.get(obstacle.shape)
-        if wanted is None:
+        sizes = _SIZES.get(obstacle.shape)
+        if sizes is None:
             continue
         fields = [name for name in ("size_m", "radius_m", "height_m") if getattr(obstacle, name) is not None]
-        for name in wanted:
+        for name in sizes:
             if name not in fields:
                 yield f"{path}.{name}", f"is missing; must be given for a {obstacle.shape}"
         for name in fields:
-            if name not in wanted:
+            if name not in sizes:
                 yield f"{path}.{name}", f"is given; must be left out of a {obstacle.shape}"
-        if sorted(fields) != sorted(wanted) or not _known(obstacle.position_m, obstacle.yaw_deg):
+        if sorted(fields) != sorted(sizes) or not _known(obstacle.position_m, obstacle.yaw_deg):
             continue
         row = row_of(obstacle)
-        x, reach = row[CENTRE], sum(row[HALF:])  # no point of the obstacle is farther from its centre, at any yaw
-        for drone, p_W, least in starts:
-            if abs(p_W[0] - x) >= reach + least:
+        x, extent = row[CENTRE], sum(row[HALF:])  # no point of the obstacle is farther from its centre, at any yaw
+        for drone, p_W, clearance in starts:
+            if abs(p_W[0] - x) >= extent + clearance:
                 continue
             distance, _, _, up = nearest(row, *p_W)
             is_on_top = up > TOP_COSINE and distance > -TOP_DEPTH_M
-            if distance < least and not is_on_top:
-                place = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
-                yield f"drones[{drone}].position_m", f"{place}; must be >= {least:g} m"
+            if distance < clearance and not is_on_top:
+                actual = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
+                yield f"drones[{drone}].position_m", f"{actual}; must be >= {clearance:g} m"
 
 
 def _surface_faults(
@@ -246,14 +246,14 @@ def _surface_faults(
             sheet = hold(sheet_of(SimpleNamespace(surfaces=[surface])))
         except ValueError:  # invalid triangles are reported elsewhere
             continue
-        least = np.array([_clearance_m(drone, vehicles) for _, drone in placed])
-        places = np.array([drone.position_m for _, drone in placed])
-        distance, nearest_W = nearest_points(sheet, places, least)
-        up = places[:, 2] - nearest_W[:, 2]
-        is_on_top = (distance <= TOP_DEPTH_M) | (up > UPON_COSINE * distance)
-        for k in np.flatnonzero((distance < least) & ~is_on_top).tolist():
-            place = f"is {distance[k]:.2f} m from {surface.name or 'a surface'!r}"
-            yield f"drones[{placed[k][0]}].position_m", f"{place}; must be >= {least[k]:g} m"
+        clearances = np.array([_clearance_m(drone, vehicles) for _, drone in placed])
+        positions = np.array([drone.position_m for _, drone in placed])
+        distance, nearest_W = nearest_points(sheet, positions, clearances)
+        up = positions[:, 2] - nearest_W[:, 2]
+        is_on_top = (distance <= TOP_DEPTH_M) | (up > ON_TOP_COSINE * distance)
+        for k in np.flatnonzero((distance < clearances) & ~is_on_top).tolist():
+            actual = f"is {distance[k]:.2f} m from {surface.name or 'a surface'!r}"
+            yield f"drones[{placed[k][0]}].position_m", f"{actual}; must be >= {clearances[k]:g} m"
 
 
 def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
@@ -267,17 +267,17 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
         radius_m = vehicle.rotor_radius_m * min(1.0, scale)
         if radius_m * high > TIP_MAX_M_S:
             tip = f"so that the tip of a rotor of {radius_m:.3g} m moves at {radius_m * high:.0f} m/s"
-            most = f"sane: at most {TIP_MAX_M_S / radius_m:.0f}, the speed of sound"
-            yield "rotor_max_rad_s", f"is {high:g}, {tip}; {most}; check its unit, rad/s: rpm over 9.55"
+            allowed = f"sane: at most {TIP_MAX_M_S / radius_m:.0f}, the speed of sound"
+            yield "rotor_max_rad_s", f"is {high:g}, {tip}; {allowed}; check its unit, rad/s: rpm over 9.55"
         elif _known(drone.mass_kg, gravity):
             yield from _hover_faults(drone, vehicle, scenario.environment)
     if vehicle and _known(drone.mass_kg, drone.thrust_n_s2):
         yield from _drag_faults(drone, len(vehicle.rotors))
     if _known(drone.mass_kg, drone.arm_m, drone.inertia_kg_m2) and None not in drone.inertia_kg_m2:
-        greatest = INERTIA_MAX_MR2 * drone.mass_kg * el.square(drone.arm_m)
-        if max(drone.inertia_kg_m2) > greatest:
-            found = f"is {list(drone.inertia_kg_m2)}; sane: at most {greatest:.3g}, ten times mass_kg arm_m^2"
-            yield "inertia_kg_m2", f"{found}; check its unit, kg m^2"
+        max_inertia = INERTIA_MAX_MR2 * drone.mass_kg * el.square(drone.arm_m)
+        if max(drone.inertia_kg_m2) > max_inertia:
+            actual = f"is {list(drone.inertia_kg_m2)}; sane: at most {max_inertia:.3g}, ten times mass_kg arm_m^2"
+            yield "inertia_kg_m2", f"{actual}; check its unit, kg m^2"
     origin_m = scenario.environment and scenario.environment.height_m
     heights = {
         "position_m[2]": drone.position_m and drone.position_m[2],
@@ -297,25 +297,25 @@ def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
     A coefficient that is too small cannot be distinguished from an omitted one.
     """
     weight, v = drone.mass_kg * G_M_S2, AIR_M_S
-    of_rotors = rotors * math.sqrt(weight / (rotors * drone.thrust_n_s2))  # rad/s, sum of the rotors' speeds in a hover
+    speed_sum = rotors * math.sqrt(weight / (rotors * drone.thrust_n_s2))  # rad/s, sum of the rotors' speeds in a hover
     speeds = {
         "drag_n_s_m": (v, "N s/m"),
         "aerodynamics.linear_drag_n_s_m": (v, "N s/m"),
         "aerodynamics.quadratic_drag_n_s2_m2": (el.square(v), "N s^2/m^2"),
-        "aerodynamics.rotor_drag_n_s2_m": (of_rotors * v, "N s^2/m"),
-        "aerodynamics.rotor_inflow_n_s2_m": (of_rotors * v, "N s^2/m"),
+        "aerodynamics.rotor_drag_n_s2_m": (speed_sum * v, "N s^2/m"),
+        "aerodynamics.rotor_inflow_n_s2_m": (speed_sum * v, "N s^2/m"),
         "aerodynamics.rotor_lift_n_s2_m2": (rotors * el.square(v), "N s^2/m^2"),
     }
     for path, (factor, unit) in speeds.items():
         section, _, name = path.rpartition(".")
-        given = getattr(getattr(drone, section, None) if section else drone, name, None)
-        coefficients = given if isinstance(given, Sequence) else [given]
-        greatest = max((each for each in coefficients if each is not None), default=0.0)
-        if greatest * factor >= weight:
-            found = f"is {show(given)}, so that air at {v:g} m/s pushes with {greatest * factor:.3g} N"
+        value = getattr(getattr(drone, section, None) if section else drone, name, None)
+        coefficients = value if isinstance(value, Sequence) else [value]
+        largest = max((each for each in coefficients if each is not None), default=0.0)
+        if largest * factor >= weight:
+            actual = f"is {show(value)}, so that air at {v:g} m/s pushes with {largest * factor:.3g} N"
             yield (
                 path,
-                f"{found}; sane: less than {weight:.3g} N, its weight: {weight / factor:.3g}; check its unit, {unit}",
+                f"{actual}; sane: less than {weight:.3g} N, its weight: {weight / factor:.3g}; check its unit, {unit}",
             )
 
 
@@ -326,21 +326,21 @@ def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fa
     low, high = drone.rotor_min_rad_s, drone.rotor_max_rad_s
     weight = drone.mass_kg * environment.gravity_m_s2
     lift = count * thrust * el.square(high) / shares.max()
-    most = LIFT_SHARE_MAX * lift / environment.gravity_m_s2
-    if drone.mass_kg >= most:
-        yield "mass_kg", f"is {drone.mass_kg:g}; must be < {most:.3f}, nine tenths of what its rotors lift"
+    max_kg = LIFT_SHARE_MAX * lift / environment.gravity_m_s2
+    if drone.mass_kg >= max_kg:
+        yield "mass_kg", f"is {drone.mass_kg:g}; must be < {max_kg:.3f}, nine tenths of what its rotors lift"
         return
     if weight < THRUST_SHARE_MIN * lift:
-        flown = f"so that it hovers at {100 * weight / lift:.2g} % of what its rotors lift ({lift:.3g} N)"
+        hover = f"so that it hovers at {100 * weight / lift:.2g} % of what its rotors lift ({lift:.3g} N)"
         units = "check their units, N s^2, rad/s and kg (thrust = thrust_n_s2 times speed^2)"
-        yield "thrust_n_s2", f"is {thrust:g}, {flown}; sane: {100 * THRUST_SHARE_MIN:g} to 90 %; {units}"
+        yield "thrust_n_s2", f"is {thrust:g}, {hover}; sane: {100 * THRUST_SHARE_MIN:g} to 90 %; {units}"
         return
     tilt, lean = drone.limits and drone.limits.tilt_deg, math.degrees(el.acos(weight / (LIFT_SHARE_MAX * lift)))
-    cut = math.degrees(el.acos(vehicle.firmware.tilt_cut_cosine))
+    cut_deg = math.degrees(el.acos(vehicle.firmware.tilt_cut_cosine))
     if tilt is not None and tilt > (most_deg := max(lean, TILT_FREE_DEG)):
         yield "limits.tilt_deg", f"is {tilt:g}; must be <= {most_deg:.1f}; its rotors carry its weight up to {lean:.1f}"
-    if tilt is not None and tilt >= cut:
-        yield "limits.tilt_deg", f"is {tilt:g}; must be < {cut:.1f}, at which its firmware cuts the rotors"
+    if tilt is not None and tilt >= cut_deg:
+        yield "limits.tilt_deg", f"is {tilt:g}; must be < {cut_deg:.1f}, at which its firmware cuts the rotors"
     density = environment.air_density_kg_m3
     if not _known(torque, density):
         return
@@ -350,11 +350,11 @@ def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fa
         yield "rotor_min_rad_s", f"is {low:g}; must be < {speeds.min():.1f}, the speed of a rotor in a hover"
     battery = vehicle.battery
     power = float(torque * thin * (speeds**3).sum()) / battery.efficiency
-    least, greatest = (each * drone.mass_kg for each in HOVER_W_KG)
-    if not least <= power <= greatest:
+    min_w, max_w = (each * drone.mass_kg for each in HOVER_W_KG)
+    if not min_w <= power <= max_w:
         takes = f"so that a hover takes {power:.3g} W"
         units = "check its unit, N m s^2: multiply a torque per thrust in m by thrust_n_s2"
-        yield "torque_nm_s2", f"is {torque:g}, {takes}; sane: {least:.3g} to {greatest:.3g} W for its mass; {units}"
+        yield "torque_nm_s2", f"is {torque:g}, {takes}; sane: {min_w:.3g} to {max_w:.3g} W for its mass; {units}"
     elif drone.battery_mah is not None:
         power += battery.electronics_w
         endurance = drone.battery_mah * COULOMB_PER_MAH * battery.voltage_v / power
@@ -368,8 +368,8 @@ def _sensor_faults(sensors: Any) -> Iterator[Fault]:
     if sensors.as_printed and sensors.preset not in (None, "paper"):
         yield "as_printed", "is true; must be false unless preset is paper"
     if sensors.imu and _known(sensors.imu.rate_hz) and sensors.imu.rate_hz > BOARD_RATE_HZ:
-        most = f"{BOARD_RATE_HZ:g}, the rate of the navigation board"
-        yield "imu.rate_hz", f"is {sensors.imu.rate_hz:g}; must be <= {most}"
+        limit = f"{BOARD_RATE_HZ:g}, the rate of the navigation board"
+        yield "imu.rate_hz", f"is {sensors.imu.rate_hz:g}; must be <= {limit}"
     for name, kind in STOCK.items():
         for channel in kind.channels:
             model = getattr(getattr(sensors, name), channel.settings, None)
@@ -384,12 +384,12 @@ def _sensor_faults(sensors: Any) -> Iterator[Fault]:
 def _own_sensor_faults(drones: _Entries) -> Iterator[Fault]:
     first: dict[str, tuple[int, str]] = {}
     fields_of: dict[str, dict[str, str]] = {}
-    taken = {kind.__name__ for kind in messages.types_by_shape().values()}
+    used = {kind.__name__ for kind in messages.types_by_shape().values()}
     for index, drone in drones:
         for name, section in own_sections(drone).items():
             message = section[DECLARED]["message"]
             path = f"drones[{index}].sensors.{name}.{DECLARED}.message"
-            if message in taken:
+            if message in used:
                 yield path, f"is {show(message)}, a message of the contract; must be a different name"
             elif fields_of.setdefault(message, section[DECLARED]["fields"]) != section[DECLARED]["fields"]:
                 yield path, f"is {show(message)}, which another sensor declares with other fields; must be unique"
@@ -400,17 +400,17 @@ def _own_sensor_faults(drones: _Entries) -> Iterator[Fault]:
 
 
 def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
-    known = _names(drones)
-    judged = len(known) == len(drones) and bool(drones)
+    names = _names(drones)
+    is_checked = len(names) == len(drones) and bool(drones)
     owner: dict[str, str] = {}
     for index, cluster in clusters:
         called = cluster.name or f"clusters[{index}]"
-        for place, name in _entries(cluster.drones):
-            path = f"clusters[{index}].drones[{place}]"
+        for k, name in _entries(cluster.drones):
+            path = f"clusters[{index}].drones[{k}]"
             if name in owner:
                 yield path, f"is {name!r}, which {owner[name]!r} flies already; a drone is in one cluster"
-            elif judged and name not in known:
-                yield path, f"is {name!r}; must be one of the drones {listed(list(dict.fromkeys(known)))}"
+            elif is_checked and name not in names:
+                yield path, f"is {name!r}; must be one of the drones {listed(list(dict.fromkeys(names)))}"
             owner.setdefault(name, called)
 
 
@@ -459,9 +459,9 @@ def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Faul
         yield "template_m", "is missing, and the robots start on one line; must be given, or space must be triad"
 
 
-def _in_line(places: list[Any]) -> bool:
+def _in_line(points: list[Any]) -> bool:
     """Whether points (n, 3) are collinear: within TEMPLATE_WIDTH_MIN_M of a line, root mean square."""
-    p = np.array(places, dtype=float)
+    p = np.array(points, dtype=float)
     widths = singular_values(p - p.mean(axis=0)) / np.sqrt(len(p))
     return el.length(widths[1:].tolist()) < TEMPLATE_WIDTH_MIN_M
 
@@ -478,9 +478,9 @@ def _plan_faults(cluster: Any) -> Iterator[Fault]:
 
 
 def _order_faults(path: str, points: list[Any] | None) -> Iterator[Fault]:
-    for (_, before), (index, after) in pairwise(_entries(points)):
-        if _known(before.at_s, after.at_s) and after.at_s <= before.at_s:
-            yield f"{path}[{index}].at_s", f"is {after.at_s:g}; must be > {before.at_s:g}, the time before it"
+    for (_, previous), (index, current) in pairwise(_entries(points)):
+        if _known(previous.at_s, current.at_s) and current.at_s <= previous.at_s:
+            yield f"{path}[{index}].at_s", f"is {current.at_s:g}; must be > {previous.at_s:g}, the time before it"
 
 
 def _reference_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
@@ -496,14 +496,14 @@ def _reference_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> It
         elif drone.name is not None:
             flown_by[drone.name] = path
         yield from _under(path, _path_faults(drone.reference))
-    known = _names(drones)
+    names = _names(drones)
     exchanges = scenario.exchanges if isinstance(scenario.exchanges, list) else []
     for index, exchange in _entries(exchanges):
         path = f"exchanges[{index}]"
-        for place, name in _entries(exchange.drones):
-            at = f"{path}.drones[{place}]"
-            if len(known) == len(drones) and name not in known:
-                yield at, f"is {name!r}; must be one of the drones {listed(list(dict.fromkeys(known)))}"
+        for k, name in _entries(exchange.drones):
+            at = f"{path}.drones[{k}]"
+            if len(names) == len(drones) and name not in names:
+                yield at, f"is {name!r}; must be one of the drones {listed(list(dict.fromkeys(names)))}"
             elif name in flown_by:
                 yield at, f"is {name!r}, which {flown_by[name]} flies; a drone has one of cluster, reference, exchange"
             flown_by.setdefault(name, path)
@@ -522,17 +522,17 @@ def _reference_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> It
 
 def _path_faults(reference: Any) -> Iterator[Fault]:
     """Yield conflicts between the fields of one drone's reference."""
-    given = [name for name in PATHS if getattr(reference, name)]
-    if len(given) > 1:
-        yield given[1], f"is given together with {given[0]}; must be only one of {', '.join(PATHS)}"
-    if given and reference.start_s is None:
-        yield "start_s", f"is missing; must say when {given[0]} begins"
-    if not given and reference.start_s is not None:
+    paths = [name for name in PATHS if getattr(reference, name)]
+    if len(paths) > 1:
+        yield paths[1], f"is given together with {paths[0]}; must be only one of {', '.join(PATHS)}"
+    if paths and reference.start_s is None:
+        yield "start_s", f"is missing; must say when {paths[0]} begins"
+    if not paths and reference.start_s is not None:
         yield "start_s", f"is {reference.start_s:g} without a path; must be left out, or with one of {', '.join(PATHS)}"
     if _known(reference.start_s, reference.takeoff_s) and reference.start_s < reference.takeoff_s:
         yield "start_s", f"is {reference.start_s:g}; must be >= takeoff_s ({reference.takeoff_s:g})"
     for name in ("constants", "duration_s"):
-        if getattr(reference, name) and "expressions" not in given:
+        if getattr(reference, name) and "expressions" not in paths:
             yield name, "is given; must be left out without expressions"
     for name in ("waypoints", "minimum_snap"):
         points = getattr(reference, name)
@@ -560,17 +560,17 @@ def _process_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iter
     if action is not None and action not in WORLD_DEATHS:
         yield "processes.on_death.world", f"is {action!r}; must be {' or '.join(WORLD_DEATHS)}"
     first: dict[str, int] = {}
-    things = {role: (each.about, drones if each.about == "drone" else clusters) for role, each in AGENTS.items()}
-    things[PILOT] = "drone with a reference", _piloted(scenario, drones)
+    entries_of = {role: (each.about, drones if each.about == "drone" else clusters) for role, each in AGENTS.items()}
+    entries_of[PILOT] = "drone with a reference", _piloted(scenario, drones)
     for index, name in _entries(processes and processes.expect):
         if first.setdefault(name, index) != index:
             yield f"processes.expect[{index}]", f"is {name!r}, as expect[{first[name]}]; must be unique"
         role, _, thing = name.partition(".")
-        kind, entries = things.get(role, ("", []))
-        known = _names(entries)
-        if kind and thing not in known and len(known) == len(entries):
-            named = listed(known) or f"a {kind} (the scenario has none)"
-            allowed = f"must be {role}.NAME of {named}, or a name of your own"
+        kind, entries = entries_of.get(role, ("", []))
+        names = _names(entries)
+        if kind and thing not in names and len(names) == len(entries):
+            choices = listed(names) or f"a {kind} (the scenario has none)"
+            allowed = f"must be {role}.NAME of {choices}, or a name of your own"
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
 
 
@@ -586,16 +586,16 @@ def _program_faults(programs: Mapping[str, Any], roles: Sequence[str]) -> Iterat
 def _graph_faults(topology: Any, drones: list[str]) -> Iterator[Fault]:
     """Yield the faults of a topology's graph: names that are not those of other drones."""
     graph = getattr(topology, "graph", None)
-    for hearer, heard in graph.items() if isinstance(graph, dict) else ():
+    for hearer, senders in graph.items() if isinstance(graph, dict) else ():
         where = f"topology.graph.{hearer}"
         if hearer not in drones:
             yield where, f"is no drone; {suggestion(hearer, drones)}must be one of {listed(drones)}"
-        for place, name in enumerate(heard):
+        for k, name in enumerate(senders):
             others = [each for each in drones if each != hearer]
             if name not in others:
                 itself = ", the drone itself" if name == hearer else ""
                 close = suggestion(name, others)
-                yield f"{where}[{place}]", f"is {show(name)}{itself}; {close}must be one of {listed(others)}"
+                yield f"{where}[{k}]", f"is {show(name)}{itself}; {close}must be one of {listed(others)}"
 
 
 def _injected_faults(
@@ -628,10 +628,10 @@ def _sighting_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Ite
             yield from _under(f"drones[{index}].sensors", _camera_faults(drone.sensors))
             yield from _under(f"drones[{index}].sensors", _scanner_faults(drone.sensors))
     hats = scenario.environment and scenario.environment.hats
-    known = [drone.name for _, drone in drones]
-    for place, name in enumerate(hats.covered or () if hats else ()):
-        if name not in known:
-            yield f"environment.hats.covered[{place}]", f"is {show(name)}; must be one of {', '.join(map(str, known))}"
+    names = [drone.name for _, drone in drones]
+    for k, name in enumerate(hats.covered or () if hats else ()):
+        if name not in names:
+            yield f"environment.hats.covered[{k}]", f"is {show(name)}; must be one of {', '.join(map(str, names))}"
     if scenario.estimation is None or scenario.estimation.use_sightings is not True:
         return
     path, algorithm = "estimation.use_sightings", scenario.estimation.algorithm
@@ -653,22 +653,22 @@ def _camera_faults(sensors: Any) -> Iterator[Fault]:
         if not camera:
             continue
         path = f"{name}_camera"
-        of_lens = camera.width_px, camera.height_px, camera.diagonal_deg, camera.distortion
-        if None not in of_lens and None not in camera.distortion and folds(lens_of(camera)):
-            least = LEAST_K1 / el.tan(math.radians(camera.diagonal_deg) / 2) ** 2
-            given = f"is {list(camera.distortion)}, which folds a picture of {camera.diagonal_deg:g} deg"
-            needed = f"must give every pixel its own ray: if only k1 is set, k1 > {least:.3f}"
-            yield f"{path}.distortion", f"{given}; {needed}"
+        lens = camera.width_px, camera.height_px, camera.diagonal_deg, camera.distortion
+        if None not in lens and None not in camera.distortion and folds(lens_of(camera)):
+            min_k1 = K1_MIN / el.tan(math.radians(camera.diagonal_deg) / 2) ** 2
+            actual = f"is {list(camera.distortion)}, which folds a picture of {camera.diagonal_deg:g} deg"
+            needed = f"must give every pixel its own ray: if only k1 is set, k1 > {min_k1:.3f}"
+            yield f"{path}.distortion", f"{actual}; {needed}"
         if None not in (camera.exposure_ms, camera.rate_hz) and camera.exposure_ms * camera.rate_hz > 1e3:
-            most = f"{1e3 / camera.rate_hz:.4g} ms at rate_hz {camera.rate_hz:g}"
-            found = f"is {camera.exposure_ms:g}; must be <= {most}, the time from one picture to the next"
-            yield f"{path}.exposure_ms", found
+            limit = f"{1e3 / camera.rate_hz:.4g} ms at rate_hz {camera.rate_hz:g}"
+            text = f"is {camera.exposure_ms:g}; must be <= {limit}, the time from one picture to the next"
+            yield f"{path}.exposure_ms", text
     for section in ("sightings", "depth"):
         used = getattr(sensors, section)
         looks_at = (used and used.cameras) or ()
-        for place, name in enumerate(looks_at):
-            path = f"{section}.cameras[{place}]"
-            if name in looks_at[:place]:
+        for k, name in enumerate(looks_at):
+            path = f"{section}.cameras[{k}]"
+            if name in looks_at[:k]:
                 yield path, f"is {name!r}, as cameras[{looks_at.index(name)}]; must be unique"
             elif name in cameras and not cameras[name]:
                 yield path, f"is {name!r}, which the drone does not have; give it {name}_camera: {{}}"
@@ -684,8 +684,8 @@ def _scanner_faults(sensors: Any) -> Iterator[Fault]:
             yield f"{name}.min_m", f"is {own.min_m:g}; must be < max_m ({own.max_m:g})"
         rows = {"lidar": "channels", "depth": "rows"}.get(name)
         if rows and _known(getattr(own, rows), own.columns) and getattr(own, rows) * own.columns > RAYS_MAX:
-            most = f"must be <= {RAYS_MAX // getattr(own, rows)} with {rows} {getattr(own, rows)}"
-            yield f"{name}.columns", f"is {own.columns}; {most}: {RAYS_MAX} rays per message"
+            limit = f"must be <= {RAYS_MAX // getattr(own, rows)} with {rows} {getattr(own, rows)}"
+            yield f"{name}.columns", f"is {own.columns}; {limit}: {RAYS_MAX} rays per message"
     azimuth = sensors.lidar and sensors.lidar.azimuth_deg
     if azimuth and None not in azimuth and not 0 < azimuth[1] - azimuth[0] <= 360:
         yield "lidar.azimuth_deg", f"is {show(list(azimuth))}; must be [first, last], rising by at most 360"

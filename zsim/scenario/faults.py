@@ -28,9 +28,9 @@ ROTORS = ("front_left", "front_right", "rear_right", "rear_left")  # in the orde
 PROCESS_KILL = "process_kill"
 VECTOR_SIZE = 3  # numbers in a bias given as a list
 ORIGIN = (0.0, 0.0, 0.0)  # m in W, position of a process that `place` omits and no drone carries
-FOR_EVER_S = 1e6  # s, length of the longest scenario
+FOREVER_S = 1e6  # s, length of the longest scenario
 UNGATED = ("world", "recorder", "console", "gateway", "router")  # roles outside the lockstep, which ignore faults
-ALIKE = 0.85  # minimum difflib ratio; design choice: words as long as "controller" may differ by one typing error
+SIMILARITY_MIN = 0.85  # of difflib; design choice: words as long as "controller" may differ by one typing error
 COMMON = ("kind", "target", "at_s", "for_s")  # fields of every fault; all others are parameters
 
 
@@ -63,9 +63,9 @@ class FaultKind(NamedTuple):
 
 
 def _number(
-    name: str, description: str, unit: str, least: float = -1e9, most: float = 1e9, **more: Any
+    name: str, description: str, unit: str, low: float = -1e9, high: float = 1e9, **options: Any
 ) -> FaultParameter:
-    return FaultParameter(name, "number", description, unit, least, most, **more)
+    return FaultParameter(name, "number", description, unit, low, high, **options)
 
 
 _PROBABILITY = FaultParameter("probability", "number", "of each sample", "", 0.0, 1.0, default=1.0, required=False)
@@ -100,8 +100,8 @@ def sensor_parts(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, S
         for channel in sensor.channels:
             part = channel.part or name
             label = channel.label or sensor.label or name
-            before = parts.get(part, SensorPart(name, label, channel, first, 0))
-            parts[part] = before._replace(width=before.width + channel.width)
+            previous = parts.get(part, SensorPart(name, label, channel, first, 0))
+            parts[part] = previous._replace(width=previous.width + channel.width)
             first += channel.width
     return parts
 
@@ -235,7 +235,7 @@ def _plain(value: Any, p: FaultParameter) -> Any:
     if p.shape == "vector":
         return [float(x) for x in value]
     if p.shape == "places":
-        return {name: place if isinstance(place, str) else [float(x) for x in place] for name, place in value.items()}
+        return {name: point if isinstance(point, str) else [float(x) for x in point] for name, point in value.items()}
     return value
 
 
@@ -285,11 +285,11 @@ def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
             return
         yield "kind", f"{_actual(fault, 'kind')}; {allowed_kinds(name, known.kinds)}"
         return
-    of = {parameter.name: parameter for parameter in kind.parameters}
+    params = {parameter.name: parameter for parameter in kind.parameters}
     for field in fault:
-        if field not in COMMON and field not in of:
-            allowed = ", ".join([*COMMON, *of])
-            yield str(field)[:40], f"is not known; {suggestion(field, (*COMMON, *of))}allowed: {allowed} ({name})"
+        if field not in COMMON and field not in params:
+            allowed = ", ".join([*COMMON, *params])
+            yield str(field)[:40], f"is not known; {suggestion(field, (*COMMON, *params))}allowed: {allowed} ({name})"
     faults = [*_target_flaws(fault, kind, known), *_time_flaws(fault, kind)]
     target = fault.get("target")
     rotors = known.rotors.get(target) if isinstance(target, str) else None
@@ -355,22 +355,22 @@ def _allowed_instead(name: str, known: Known) -> str | None:
     things = known.things()
     if role in things and thing not in things[role]:
         return f"{role}.NAME of {listed(things[role])}"
-    for ours, named in {**things, "world": ("",)}.items():
-        if thing in named and ours not in role and SequenceMatcher(None, role, ours).ratio() >= ALIKE:
-            return f"{ours}{dot}{thing}, or a less similar name"
+    for own_role, names in {**things, "world": ("",)}.items():
+        if thing in names and own_role not in role and SequenceMatcher(None, role, own_role).ratio() >= SIMILARITY_MIN:
+            return f"{own_role}{dot}{thing}, or a less similar name"
     return None
 
 
 def _time_flaws(fault: Mapping[str, Any], kind: FaultKind) -> Iterator[Flaw]:
     at_s, for_s = fault.get("at_s"), fault.get("for_s")
-    if at_s is not None and not _within(at_s, 0.0, FOR_EVER_S):
-        yield "at_s", f"is {show(at_s)}; must be from 0 to {FOR_EVER_S:g} s"
+    if at_s is not None and not _within(at_s, 0.0, FOREVER_S):
+        yield "at_s", f"is {show(at_s)}; must be from 0 to {FOREVER_S:g} s"
     if kind.lasts == "once" and for_s is not None:
         yield "for_s", f"is {show(for_s)}; must be left out"
     elif kind.lasts == "ends" and for_s is None:
         yield "for_s", "is missing; must be its duration in s"
-    elif for_s is not None and not _within(for_s, 0.0, FOR_EVER_S, above=True):
-        yield "for_s", f"is {show(for_s)}; must be > 0 and <= {FOR_EVER_S:g} s"
+    elif for_s is not None and not _within(for_s, 0.0, FOREVER_S, is_open=True):
+        yield "for_s", f"is {show(for_s)}; must be > 0 and <= {FOREVER_S:g} s"
 
 
 def _parameter_flaws(fault: Mapping[str, Any], p: FaultParameter, known: Known) -> Iterator[Flaw]:
@@ -380,12 +380,12 @@ def _parameter_flaws(fault: Mapping[str, Any], p: FaultParameter, known: Known) 
             yield p.name, f"is missing; must be {expected(p)}"
         return
     if p.shape == "places" and isinstance(value, Mapping):
-        for process, place in value.items():
+        for process, position in value.items():
             path = f"{p.name}.{str(process)[:48]}"
             if allowed := _allowed_instead(process if isinstance(process, str) else "", known):
                 yield path, f"names no process; must be {allowed}"
-            if not _is_vector(place, -1e6, 1e6) and place not in known.drones:
-                yield path, f"is {show(place)}; must be a drone or [x, y, z] in m"
+            if not _is_vector(position, -1e6, 1e6) and position not in known.drones:
+                yield path, f"is {show(position)}; must be a drone or [x, y, z] in m"
         return
     is_sound = {
         "number": lambda: _within(value, p.least, p.most, p.above),
@@ -399,14 +399,14 @@ def _parameter_flaws(fault: Mapping[str, Any], p: FaultParameter, known: Known) 
         yield p.name, f"is {show(value)}; must be {expected(p)}"
 
 
-def _is_vector(value: Any, least: float, most: float) -> bool:
-    return isinstance(value, list | tuple) and len(value) == 3 and all(_within(x, least, most) for x in value)
+def _is_vector(value: Any, low: float, high: float) -> bool:
+    return isinstance(value, list | tuple) and len(value) == 3 and all(_within(x, low, high) for x in value)
 
 
-def _within(value: Any, least: float, most: float, above: bool = False) -> bool:
+def _within(value: Any, low: float, high: float, is_open: bool = False) -> bool:
     """Whether a value is a number within limits; integers may be arbitrarily large, NaN is never within."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and least <= value <= most and not (above and value == least)
+    return number and low <= value <= high and not (is_open and value == low)
 
 
 # Faults as typed in a terminal or the console
@@ -424,14 +424,14 @@ def typed_duration_s(text: str) -> float:
     return float(match[1]) * DURATION_UNITS[match[2]]
 
 
-def typed_parameters(words: Sequence[str]) -> dict[str, Any]:
+def typed_parameters(texts: Sequence[str]) -> dict[str, Any]:
     """Return the parameters given by words NAME=VALUE, with values in YAML.
 
     Raises:
         ValueError: a word has another form, repeats a name, or names an argument or option.
     """
     values: dict[str, Any] = {}
-    for text in words:
+    for text in texts:
         name, equals, value = text.partition("=")
         if not equals or not re.fullmatch("[a-z][a-z0-9_]*", name):
             raise ValueError(f"{text[:40]!r} is not a parameter; must be NAME=VALUE, see `zsim fault kinds`")
@@ -455,22 +455,22 @@ def typed_rest(text: str) -> dict[str, Any]:
         ValueError: the text is not of the form NAME=VALUE NAME=VALUE … --for DURATION --at DURATION.
     """
     times: dict[str, float] = {}
-    words: list[str] = []
-    pending = iter(_words(text))
-    for word in pending:
-        option, equals, value = word.partition("=")
+    assignments: list[str] = []
+    pending = iter(_split(text))
+    for part in pending:
+        option, equals, value = part.partition("=")
         if option not in _OPTIONS:
-            words.append(word)
+            assignments.append(part)
             continue
         try:
             times[_OPTIONS[option]] = typed_duration_s(value if equals else next(pending, ""))
         except ValueError as error:
             raise ValueError(f"{option} {error}") from None
-    return {**typed_parameters(words), **times}
+    return {**typed_parameters(assignments), **times}
 
 
-def _words(text: str) -> list[str]:
-    words: list[str] = []
+def _split(text: str) -> list[str]:
+    texts: list[str] = []
     depth = 0
     try:
         parts = shlex.split(text)
@@ -478,13 +478,13 @@ def _words(text: str) -> list[str]:
         raise ValueError(f"{text[:40]!r}: {str(error).lower()}; must be NAME=VALUE NAME=VALUE …") from None
     for part in parts:
         if depth > 0:
-            words[-1] += f" {part}"
+            texts[-1] += f" {part}"
         else:
-            words.append(part)
+            texts.append(part)
         depth += sum(part.count(each) for each in "[{") - sum(part.count(each) for each in "]}")
-    return words
+    return texts
 
 
-def allowed_kinds(found: Any, known: Collection[str]) -> str:
-    """Return the part of an error text that says which kinds of faults are allowed instead of `found`."""
-    return f"{suggestion(found, known)}must be one of the {len(known)} that `zsim fault kinds SCENARIO` lists"
+def allowed_kinds(actual: Any, known: Collection[str]) -> str:
+    """Return the part of an error text that says which kinds of faults are allowed instead of `actual`."""
+    return f"{suggestion(actual, known)}must be one of the {len(known)} that `zsim fault kinds SCENARIO` lists"

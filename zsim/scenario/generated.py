@@ -45,17 +45,17 @@ def with_generated(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault
         environment = {**environment, "surfaces": surfaces}
     if not _KINDS.keys() & environment.keys():
         return {**document, "environment": environment}, wrong
-    given = environment.get("obstacles", [])
-    obstacles = [*given] if isinstance(given, list) else []
+    listed = environment.get("obstacles", [])
+    obstacles = [*listed] if isinstance(listed, list) else []
     parts = sound(document, Scenario)
     starts = [drone.position_m for drone in parts.drones or () if drone and drone.position_m]
     for name, kind in _KINDS.items():
         if name not in environment:
             continue
         where = f"environment.{name}"
-        found = [*faults(environment[name], kind, where)]
-        wrong += found
-        if found:
+        flaws = [*faults(environment[name], kind, where)]
+        wrong += flaws
+        if flaws:
             continue
         settings: Any = msgspec.convert(environment[name], kind)
         try:
@@ -67,8 +67,8 @@ def with_generated(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault
             obstacles += _forest(settings, rng, starts, where) if name == "forest" else _corridor(settings, rng)
         except DocumentError as error:
             wrong += faults_in(error)
-    rest = {name: value for name, value in environment.items() if name not in _KINDS}
-    return {**document, "environment": {**rest, "obstacles": obstacles} if obstacles else rest}, wrong
+    others = {name: value for name, value in environment.items() if name not in _KINDS}
+    return {**document, "environment": {**others, "obstacles": obstacles} if obstacles else others}, wrong
 
 
 def _forest(own: Forest, rng: np.random.Generator, starts: Sequence[Position], where: str) -> list[Entry]:
@@ -84,7 +84,7 @@ def _forest(own: Forest, rng: np.random.Generator, starts: Sequence[Position], w
     west, south, east, north = own.area_m
     if west >= east or south >= north:
         raise DocumentError([f"{where}.area_m is {list(own.area_m)}; must be [west, south, east, north], rising"])
-    places = np.empty((own.trees, 3))  # x, y, radius
+    trunks = np.empty((own.trees, 3))  # x, y, radius
     clear = np.array([(x, y) for x, y, _ in starts]).reshape(-1, 2)
     entries: list[Entry] = []
     for count in range(own.trees):
@@ -92,17 +92,17 @@ def _forest(own: Forest, rng: np.random.Generator, starts: Sequence[Position], w
             x, y = (round(each, 3) for each in rng.uniform((west, south), (east, north)).tolist())
             radius, height = (round(rng.uniform(*span), 3) for span in (own.radius_m, own.height_m))
             away = (
-                np.sqrt(np.square(places[:count, 0] - x) + np.square(places[:count, 1] - y))
-                - places[:count, 2]
+                np.sqrt(np.square(trunks[:count, 0] - x) + np.square(trunks[:count, 1] - y))
+                - trunks[:count, 2]
                 - radius
             )
             from_starts = np.sqrt(np.square(clear[:, 0] - x) + np.square(clear[:, 1] - y)) - radius
             if (away >= own.gap_m).all() and (from_starts >= own.clear_m).all():
                 break
         else:
-            most = f"{count} trunks of {list(own.radius_m)} m with gap_m {own.gap_m:g} and clear_m {own.clear_m:g} fit"
-            raise DocumentError([f"{where}.trees is {own.trees}; must be less: {most}"])
-        places[count] = x, y, radius
+            limit = f"{count} trunks of {list(own.radius_m)} m with gap_m {own.gap_m:g} and clear_m {own.clear_m:g} fit"
+            raise DocumentError([f"{where}.trees is {own.trees}; must be less: {limit}"])
+        trunks[count] = x, y, radius
         trunk = {"shape": "cylinder", "position_m": [x, y, 0.0], "radius_m": radius, "height_m": height}
         entries.append({"name": f"tree{count + 1}", **trunk})
     return entries
@@ -118,10 +118,10 @@ def _corridor(own: Corridor, rng: np.random.Generator) -> list[Entry]:
         middles.append((x + own.length_m * el.cos(heading), y + own.length_m * el.sin(heading)))
     bends = [*zip(middles, headings, turns, strict=False), (middles[-1], headings[-1], 0.0)]
     entries: list[Entry] = []
-    for side, off in (("left", 1.0), ("right", -1.0)):
+    for side, sign in (("left", 1.0), ("right", -1.0)):
         corners = []  # corners of a wall's centre line, on the bisector of each bend
         for (x, y), heading, turn in bends:
-            across, away = heading - 0.5 * turn, 0.5 * off * (own.width_m + own.wall_m) / el.cos(0.5 * turn)
+            across, away = heading - 0.5 * turn, 0.5 * sign * (own.width_m + own.wall_m) / el.cos(0.5 * turn)
             corners.append((x - away * el.sin(across), y + away * el.cos(across)))
         for k, ((ax, ay), (bx, by)) in enumerate(pairwise(corners)):
             wall = {
@@ -158,24 +158,24 @@ def _boxes(own: Cloud, where: str) -> list[Entry]:
                 row[-1][1] = x
             else:
                 row.append([x, x])
-    found = sorted((x, y, z) for (y, *z), row in rows.items() for x in row)
-    if len(found) > OBSTACLES_MAX:
-        made = f"which makes {len(found)} boxes; must make <= {OBSTACLES_MAX}"
-        raise DocumentError([f"{where}.cell_m is {own.cell_m:g}, {made}"])
+    blocks = sorted((x, y, z) for (y, *z), row in rows.items() for x in row)
+    if len(blocks) > OBSTACLES_MAX:
+        excess = f"which makes {len(blocks)} boxes; must make <= {OBSTACLES_MAX}"
+        raise DocumentError([f"{where}.cell_m is {own.cell_m:g}, {excess}"])
     entries: list[Entry] = []
-    for (first, last), y, (low, high) in found:
+    for (first, last), y, (low, high) in blocks:
         middle = [0.5 * (first + last + 1), y + 0.5, float(low)]
         sides = [last + 1 - first, 1, high + 1 - low]
-        place = [round(p + own.cell_m * m, 3) for p, m in zip(own.position_m, middle, strict=True)]
+        centre = [round(p + own.cell_m * m, 3) for p, m in zip(own.position_m, middle, strict=True)]
         size = [round(own.cell_m * side, 3) for side in sides]
-        entries.append({"name": f"cloud{len(entries) + 1}", "shape": "box", "position_m": place, "size_m": size})
+        entries.append({"name": f"cloud{len(entries) + 1}", "shape": "box", "position_m": centre, "size_m": size})
     return entries
 
 
-def _read_surfaces(given: list[Any]) -> tuple[list[Any], list[Fault]]:
+def _read_surfaces(listed: list[Any]) -> tuple[list[Any], list[Fault]]:
     """Return the entries of `surfaces:` with triangles in place of files, and the files' faults."""
     surfaces, wrong, count = [], [], 0
-    for index, entry in enumerate(given):
+    for index, entry in enumerate(listed):
         where, triangles = f"environment.surfaces[{index}]", None
         surfaces.append(entry)
         if not isinstance(entry, dict):
@@ -234,9 +234,9 @@ def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
         _refuse(path, where, f"ends in {kind or 'nothing'}", "must be .stl, .obj or .ply, or a height map .csv or .npy")
     if not len(triangles):
         size = path.stat().st_size
-        found = f"of {size} bytes has no triangle that could be read"
+        fault = f"of {size} bytes has no triangle that could be read"
         allowed = "; a binary STL has 84 bytes and 50 for each triangle" if kind == ".stl" else ""
-        _refuse(path, where, found, f"must have one or more{allowed}")
+        _refuse(path, where, fault, f"must have one or more{allowed}")
     if len(wrong := np.flatnonzero(~np.isfinite(triangles).all(axis=1))):
         _refuse(path, where, f"has a number that is not finite in triangle {wrong[0] + 1}", "must be finite")
     return triangles
@@ -285,8 +285,8 @@ def _read(path: Path, where: str, read: Callable[[Path], Any]) -> Any:
         )
 
 
-def _refuse(path: Path, where: str, found: str, allowed: str) -> NoReturn:
-    raise DocumentError([f"{where} is {show(str(path))}, which {found}{'; ' if allowed else ''}{allowed}"])
+def _refuse(path: Path, where: str, fault: str, allowed: str) -> NoReturn:
+    raise DocumentError([f"{where} is {show(str(path))}, which {fault}{'; ' if allowed else ''}{allowed}"])
 
 
 def _of_heights(heights: Array, cell_m: float) -> Array:

@@ -56,14 +56,14 @@ def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
 def _declared(entry: dict[str, Any], where: str) -> dict[str, Any]:
     name: str = LAWS.get(entry["class"]) or entry["class"]
     kind: Any = plugin.load(name, f"{where}.class", AgentMethods)
-    given = parameters.resolved(kind, entry.get("parameters", {}), f"{where}.parameters", OF_THE_RUN)
+    values = parameters.resolved(kind, entry.get("parameters", {}), f"{where}.parameters", OF_THE_RUN)
     published, per = messages_of(kind, f"{where}.class"), entry.get("per", "drone")
     for each in published:
         if about(each) != per:
             raise DocumentError([f"{where}.per is {per!r}, and the key of {each.__name__} is {each.key}; must agree"])
     return {
         "class": name,
-        "parameters": given,
+        "parameters": values,
         "declared": [msgspec.to_builtins(message_info(each)) for each in published],
     }
 
@@ -76,9 +76,9 @@ def with_parameters(document: dict[str, Any]) -> list[Fault]:
     wrong: list[Fault] = []
     clusters = document.get("clusters")
     sections = [(f"clusters[{i}]", each) for i, each in enumerate(clusters if isinstance(clusters, list) else [])]
-    named = [(where, each, part, f"{part}_parameters") for where, each in sections for part in ("space", "law")]
-    named.append(("estimation", document.get("estimation"), "algorithm", "parameters"))
-    for where, section, part, field in named:
+    references = [(where, each, part, f"{part}_parameters") for where, each in sections for part in ("space", "law")]
+    references.append(("estimation", document.get("estimation"), "algorithm", "parameters"))
+    for where, section, part, field in references:
         name = section.get(part) if isinstance(section, dict) else None
         if not (isinstance(name, str) and re.fullmatch(plugin.CLASS_NAME, name)):
             continue
@@ -86,12 +86,12 @@ def with_parameters(document: dict[str, Any]) -> list[Fault]:
             kind = plugin.load(name, f"{where}.{part}", object)
         except DocumentError:
             continue
-        given = section.get(field, {})
+        values = section.get(field, {})
         try:
             if parameters.has_parameters(kind):
-                section[field] = parameters.resolved(kind, given, f"{where}.{field}")
+                section[field] = parameters.resolved(kind, values, f"{where}.{field}")
             else:
-                parameters.bound(kind, given, f"{where}.{field}")
+                parameters.bound(kind, values, f"{where}.{field}")
         except DocumentError as error:
             wrong += faults_in(error)
     return wrong
@@ -104,18 +104,18 @@ def law_faults(cluster: Any, drones: Mapping[str, Any], unread: Collection[str])
         drones: valid parts of the drones by name.
         unread: names of sensors absent from these because their modules could not be read.
     """
-    given = [name for name in ("law_sensors", "law_map") if getattr(cluster, name)]
-    if given and cluster.law in (UNSET, "proportional"):
-        yield from ((name, "is given, but the stock law uses none; must be left out") for name in given)
+    grants = [name for name in ("law_sensors", "law_map") if getattr(cluster, name)]
+    if grants and cluster.law in (UNSET, "proportional"):
+        yield from ((name, "is given, but the stock law uses none; must be left out") for name in grants)
         return
     has = [drones[name].sensors for name in cluster.drones or () if name in drones]
     if not has or None in has:
         return
     names = list(dict.fromkeys(name for sensors in has for name in sensor_names(sensors)))
     first: dict[str, int] = {}
-    for place, name in enumerate(cluster.law_sensors or ()):
-        where = f"law_sensors[{place}]"
-        if name is not None and first.setdefault(name, place) != place:
+    for k, name in enumerate(cluster.law_sensors or ()):
+        where = f"law_sensors[{k}]"
+        if name is not None and first.setdefault(name, k) != k:
             yield where, f"is {name!r}, as law_sensors[{first[name]}]; must be unique"
         elif name is not None and name not in (*names, *unread):
             yield where, f"is {name!r}, which none of its drones has; must be one of {listed(names)}"
@@ -155,5 +155,5 @@ def agent_faults(agents: Any, roles: Any, clusters: bool) -> Iterator[Fault]:
         for info in agent.declared or ():
             first = writers.setdefault(info.key, role)
             if first != role:
-                what = f"publishes {info.key} as agents.{first} does"
-                yield f"agents.{role}.class", f"{what}; each key must have one writer"
+                conflict = f"publishes {info.key} as agents.{first} does"
+                yield f"agents.{role}.class", f"{conflict}; each key must have one writer"

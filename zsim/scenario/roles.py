@@ -123,9 +123,9 @@ def check_pace(scenario: Scenario, mode: str) -> None:
     """Raise ScenarioError if a mode other than realtime has external drones, which fly in wall time."""
     external = scenario.external()
     if external and mode != "realtime":
-        who = f"{listed(external)} {'is' if len(external) == 1 else 'are'} external"
+        subject = f"{listed(external)} {'is' if len(external) == 1 else 'are'} external"
         needed = "it flies in wall time: run with --realtime, in separate processes"
-        raise ScenarioError([f"{scenario.name}: body of {who}, and the run is in {mode}; {needed}"])
+        raise ScenarioError([f"{scenario.name}: body of {subject}, and the run is in {mode}; {needed}"])
 
 
 def check_alone(scenario: Scenario) -> None:
@@ -152,7 +152,7 @@ def drivers_of(scenario: Scenario) -> list[str]:
 def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
     """Return a line about the drivers to start with a run; empty without external drones."""
     drivers, awaited_names = drivers_of(scenario), expected_processes(scenario)
-    awaited, others = (listed([d for d in drivers if (d in awaited_names) is wanted]) for wanted in (True, False))
+    awaited, others = (listed([d for d in drivers if (d in awaited_names) is expected]) for expected in (True, False))
     waits = [f"the run waits for {awaited}"] if awaited else []
     waits += [f"{others} may join at any time"] if others else []
     return [f"external drones: {', and '.join(waits)}; start drivers with --connect {endpoint}"] if drivers else []
@@ -233,8 +233,8 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
 def _granted_own(agent: OwnAgent, thing: str, scenario: Scenario) -> Rights:
     """Return the rights of a user's agent: to read everything except the truth, and to command its own drones."""
     drones = [drone.name for drone in scenario.drones]
-    of = {"drone": [thing], "run": drones}
-    own = of.get(agent.per) or scenario.cluster(thing).drones
+    drones_by_scope = {"drone": [thing], "run": drones}
+    own = drones_by_scope.get(agent.per) or scenario.cluster(thing).drones
     reads = [keys.GATE, keys.gate("*"), keys.sensors("*"), keys.estimate("*"), keys.detections("*")]
     reads += [keys.cluster_state("*"), keys.reference("*"), *(each.key for each in scenario.own_messages())]
     writes = [keys.command(drone, "*") for drone in own]
@@ -267,9 +267,9 @@ def watched_drones(thing: str, scenario: Scenario) -> list[str]:
     return [thing] if thing in names else [drone.name for drone in scenario.drones if drone.sensors.cameras()]
 
 
-def combined(many: Iterable[Rights]) -> Rights:
+def combined(rights: Iterable[Rights]) -> Rights:
     """Return the union of several rights, as needed by a router that forwards for all of them."""
-    columns = zip(Rights(), *many, strict=True)
+    columns = zip(Rights(), *rights, strict=True)
     return Rights(*(tuple(dict.fromkeys(key for keys_ in column for key in keys_)) for column in columns))
 
 

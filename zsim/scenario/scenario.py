@@ -593,9 +593,9 @@ class Scenario(Spec, frozen=True, kw_only=True):
     def piloted(self) -> dict[str, DroneReference | Exchange]:
         """Return the references and exchanges that drones outside clusters fly, by drone in the scenario's order."""
         exchanges = [] if self.exchanges is UNSET else self.exchanges
-        found: dict[str, DroneReference | Exchange] = {name: each for each in exchanges for name in each.drones}
-        found |= {drone.name: drone.reference for drone in self.drones if drone.reference is not UNSET}
-        return {drone.name: found[drone.name] for drone in self.drones if drone.name in found}
+        plans: dict[str, DroneReference | Exchange] = {name: each for each in exchanges for name in each.drones}
+        plans |= {drone.name: drone.reference for drone in self.drones if drone.reference is not UNSET}
+        return {drone.name: plans[drone.name] for drone in self.drones if drone.name in plans}
 
     @property
     def own_agents(self) -> dict[str, OwnAgent]:

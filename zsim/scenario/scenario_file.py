@@ -100,11 +100,11 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
     unread: set[str] = set()  # names of users' sensors that are faulty, or must not be imported
     vehicles = {name: vehicle_of(name) for name in MODELS}  # by model
 
-    given = _in_channel_units(document.get("sensors"), "sensors", misread)
-    shared_sensors = given or {}
+    section = _in_channel_units(document.get("sensors"), "sensors", misread)
+    shared_sensors = section or {}
     sensors = _with_preset(shared_sensors, ARDRONE2.sensor_preset)
-    rest, _, wrong = separate(sensors) if isinstance(sensors, dict) else (sensors, {}, [])
-    faulty = {path.partition(".")[0] for path, _ in (*wrong, *faults(rest, Sensors))}
+    stock, _, wrong = separate(sensors) if isinstance(sensors, dict) else (sensors, {}, [])
+    faulty = {path.partition(".")[0] for path, _ in (*wrong, *faults(stock, Sensors))}
     usable = {} if "" in faulty else {name: each for name, each in shared_sensors.items() if name not in faulty}
     shared_vehicle = document.get("vehicle")
     if isinstance(shared_vehicle, dict):
@@ -154,19 +154,19 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
     flaws = chain(misread, faults(document, Document), unknown, unsound, between)
     if shortened:
         flaws = ((re.sub(r"^topology\.graph", "topology", path), text) for path, text in flaws)
-    found = first_lines(chain(lines, (f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws)))
-    if found:
-        raise ScenarioError(found)
+    errors = first_lines(chain(lines, (f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws)))
+    if errors:
+        raise ScenarioError(errors)
     del document["sensors"]
     document.pop("vehicle", None)
     return msgspec.convert(document, Scenario)
 
 
-def with_defaults(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+def with_defaults(base: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
     merged = dict(base)
-    for key, value in over.items():
-        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = with_defaults(merged[key], value) if both else value
+    for key, value in overrides.items():
+        are_maps = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = with_defaults(merged[key], value) if are_maps else value
     return merged
 
 
@@ -194,10 +194,10 @@ def _separated(section: Any, where: str, unsound: list[Fault], unread: set[str],
     """Return a `sensors:` section with the users' sensors moved into `own`."""
     if not isinstance(section, dict):
         return section
-    rest, own, wrong = separate(section, imports)
+    stock, own, wrong = separate(section, imports)
     unsound += [(f"{where}.{path}", text) for path, text in wrong]
-    unread |= section.keys() - rest.keys() - own.keys()
-    return {**rest, "own": own} if own else rest
+    unread |= section.keys() - stock.keys() - own.keys()
+    return {**stock, "own": own} if own else stock
 
 
 def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
@@ -219,8 +219,8 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
 def _is_graph(topology: Any) -> bool:
     """Whether a `topology:` section is only a graph, given by name or as lists of the drones that each drone hears."""
     if isinstance(topology, dict):
-        named = any(isinstance(heard, list) for heard in topology.values())
-        return named and not topology.keys() & set(Topology.__struct_fields__)
+        has_lists = any(isinstance(senders, list) for senders in topology.values())
+        return has_lists and not topology.keys() & set(Topology.__struct_fields__)
     return isinstance(topology, str)
 
 
@@ -228,8 +228,8 @@ def _with_deaths(processes: Any, own: Any, action: str) -> Any:
     """Return a `processes:` section with the default `on_death` of users' roles and programs."""
     if not (isinstance(processes, dict) and isinstance(own, dict)):
         return processes
-    given = processes.get("on_death", {})
-    return {**processes, "on_death": dict.fromkeys(own, action) | given} if isinstance(given, dict) else processes
+    declared = processes.get("on_death", {})
+    return {**processes, "on_death": dict.fromkeys(own, action) | declared} if isinstance(declared, dict) else processes
 
 
 def _vehicle_of(
@@ -296,12 +296,12 @@ def apply_override(document: dict[str, Any], text: str, parse: Callable[[str], A
 def steps_of(path: str, document: Mapping[str, Any] = NOTHING) -> list[str]:
     """Return the steps of a path from the top of a scenario: fields, and entries by index or name.
 
-    Arguments and errors as for `whole_path`.
+    Arguments and errors as for `full_path`.
     """
-    return [word or bracket for word, bracket in _STEP.findall(whole_path(path, document))]
+    return [name or bracket for name, bracket in _STEP.findall(full_path(path, document))]
 
 
-def whole_path(path: str, document: Mapping[str, Any] = NOTHING) -> str:
+def full_path(path: str, document: Mapping[str, Any] = NOTHING) -> str:
     """Return the full path of a field in a raw document.
 
     The name of a section may be omitted if only one section has such a field: wind.gust_m_s stands for
@@ -328,10 +328,10 @@ def whole_path(path: str, document: Mapping[str, Any] = NOTHING) -> str:
         return path
     section, entry = lists[0], entries[0]
     name = entry.get("name") if isinstance(entry, dict) else None
-    whole = f"{section}.{name}" if isinstance(name, str) and _FIRST.fullmatch(name) else f"{section}[0]"
+    prefix = f"{section}.{name}" if isinstance(name, str) and _FIRST.fullmatch(name) else f"{section}[0]"
     if len(entries) > 1:
-        raise ValueError(f"is a field of each of {len(entries)} {section}; give the full path, e.g. {whole}.{path}")
-    return f"{whole}.{path}"
+        raise ValueError(f"is a field of each of {len(entries)} {section}; give the full path, e.g. {prefix}.{path}")
+    return f"{prefix}.{path}"
 
 
 @cache
@@ -343,27 +343,27 @@ def _fields(kind: Any) -> Sequence[Any]:
 
 def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:
     """Set the value at a path, creating missing or empty sections along it."""
-    place: Any = document
+    node: Any = document
     for depth, step in enumerate(steps):
-        if not isinstance(place, dict | list):
-            raise ValueError(f"{'.'.join(steps[:depth])} is {show(place)}; must be a map or a list")
+        if not isinstance(node, dict | list):
+            raise ValueError(f"{'.'.join(steps[:depth])} is {show(node)}; must be a map or a list")
         key: Any = step
-        if isinstance(place, list):
-            names = [item.get("name") if isinstance(item, dict) else None for item in place]
+        if isinstance(node, list):
+            names = [item.get("name") if isinstance(item, dict) else None for item in node]
             if step in names:
                 key = names.index(step)
-            elif re.fullmatch(r"[0-9]{1,9}", step) and int(step) < len(place):
+            elif re.fullmatch(r"[0-9]{1,9}", step) and int(step) < len(node):
                 key = int(step)
             else:
-                known = [name for name in names if isinstance(name, str)]
-                places = f"0 to {len(place) - 1}{' or ' if known else ''}{', '.join(known)}"
-                allowed = f"{suggestion(step, known)}allowed: {places if place else 'nothing, it is empty'}"
+                item_names = [name for name in names if isinstance(name, str)]
+                choices = f"0 to {len(node) - 1}{' or ' if item_names else ''}{', '.join(item_names)}"
+                allowed = f"{suggestion(step, item_names)}allowed: {choices if node else 'nothing, it is empty'}"
                 raise ValueError(f"{step[:40]} is not in {'.'.join(steps[:depth])}; {allowed}")
         if depth == len(steps) - 1:
-            place[key] = value
-        elif isinstance(place, dict) and place.get(key) is None:
-            place[key] = {}
-        place = place[key]
+            node[key] = value
+        elif isinstance(node, dict) and node.get(key) is None:
+            node[key] = {}
+        node = node[key]
 
 
 def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
@@ -401,8 +401,8 @@ def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
         except ValueError:
             numbers = []
         if len(numbers) != len(HEADER) or not all(map(math.isfinite, numbers)):
-            found = f"has {len(row)} entries: {', '.join(row)[:40]}"
-            wrong.append(f"{where} is {show(str(path))}, whose line {number} {found}; must be {len(HEADER)} numbers")
+            problem = f"has {len(row)} entries: {', '.join(row)[:40]}"
+            wrong.append(f"{where} is {show(str(path))}, whose line {number} {problem}; must be {len(HEADER)} numbers")
             continue
         axes = {axis: numbers[1 + k * TERMS : 1 + (k + 1) * TERMS] for k, axis in enumerate(AXES)}
         pieces.append({"duration_s": numbers[0], **axes})

@@ -80,10 +80,10 @@ class Surroundings:
 
     def distances_m(self, p_W: ArrayLike) -> Array:
         """Return the distance [m] of each point (P, 3) from the nearest one: negative in an obstacle, inf if empty."""
-        least = least_distances(self._obstacles, p_W)
+        distances = min_distances(self._obstacles, p_W)
         if self._sheet is not None:
-            least = np.minimum(least, nearest_points(self._sheet, p_W, np.maximum(least, 0.0))[0])
-        return least
+            distances = np.minimum(distances, nearest_points(self._sheet, p_W, np.maximum(distances, 0.0))[0])
+        return distances
 
 
 def row_of(obstacle: Any) -> list[float]:
@@ -112,13 +112,13 @@ def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, 
         round_ = row[SHAPE] == CYLINDER
         ax, ay = (r, 0.0) if round_ else (qx, qy)
         ox, oy, oz = abs(ax) - row[HALF], abs(ay) - (WIDE if round_ else row[HALF + 1]), abs(qz) - row[HALF + 2]
-        most = max(ox, oy, oz)
-        if most > 0.0:
+        largest = max(ox, oy, oz)
+        if largest > 0.0:
             ox, oy, oz = max(ox, 0.0), max(oy, 0.0), max(oz, 0.0)
             distance = math.sqrt(ox * ox + oy * oy + oz * oz)
         else:  # inside: towards the nearest face
-            distance = most
-            ox, oy, oz = 1.0 if ox == most else 0.0, 1.0 if oy == most else 0.0, 1.0 if oz == most else 0.0
+            distance = largest
+            ox, oy, oz = 1.0 if ox == largest else 0.0, 1.0 if oy == largest else 0.0, 1.0 if oz == largest else 0.0
         length = max(math.sqrt(ox * ox + oy * oy + oz * oz), TINY)
         nx, ny, nz = math.copysign(ox, ax) / length, math.copysign(oy, ay) / length, math.copysign(oz, qz) / length
         if round_:
@@ -126,37 +126,37 @@ def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, 
     return distance, c * nx - s * ny, s * nx + c * ny, nz
 
 
-def least_distances(obstacles: Iterable[Any], p_W: ArrayLike) -> NDArray[np.float64]:
+def min_distances(obstacles: Iterable[Any], p_W: ArrayLike) -> NDArray[np.float64]:
     """Return the distance [m] of each point (T, 3) from the nearest obstacle, as `nearest` does; inf without any."""
     points, rows = np.asarray(p_W, dtype=float).reshape(-1, 3), np.array([*map(row_of, obstacles)]).reshape(-1, COLUMNS)
-    least, step = np.full(len(points), np.inf), max(1, PAIRS_MAX // max(len(rows), 1))
+    minima, step = np.full(len(points), np.inf), max(1, PAIRS_MAX // max(len(rows), 1))
     for first in range(0, len(points) if len(rows) else 0, step):
         x, y, z = (points[first : first + step, None, k] - rows[:, CENTRE + k] for k in range(3))
         c, s, shape, half = rows[:, COSINE], rows[:, SINE], rows[:, SHAPE], rows[:, HALF:]
         r = np.sqrt(x * x + y * y)
         across = np.where(shape == BOX, np.abs(c * x + s * y), r) - half[:, 0]
         along = np.where(shape == BOX, np.abs(c * y - s * x) - half[:, 1], -np.inf)
-        over = np.abs(z) - half[:, 2]
-        most = np.maximum(np.maximum(across, along), over)
-        outside = np.sqrt(np.maximum(across, 0.0) ** 2 + np.maximum(along, 0.0) ** 2 + np.maximum(over, 0.0) ** 2)
-        solid = np.where(most > 0.0, outside, most)
-        least[first : first + step] = np.where(shape == SPHERE, np.sqrt(r * r + z * z) - half[:, 0], solid).min(axis=1)
-    return least
+        above = np.abs(z) - half[:, 2]
+        largest = np.maximum(np.maximum(across, along), above)
+        outside = np.sqrt(np.maximum(across, 0.0) ** 2 + np.maximum(along, 0.0) ** 2 + np.maximum(above, 0.0) ** 2)
+        solid = np.where(largest > 0.0, outside, largest)
+        minima[first : first + step] = np.where(shape == SPHERE, np.sqrt(r * r + z * z) - half[:, 0], solid).min(axis=1)
+    return minima
 
 
 def sheet_of(environment: Any) -> Sheet:
     """Return the triangles of all surfaces of a scenario's environment, with their tree."""
     each = [placed(surface) for surface in environment.surfaces or ()]
     triangle = np.concatenate([np.empty((0, TRIANGLE)), *each])
-    whose = np.repeat(np.arange(len(each), dtype=np.int32), [len(part) for part in each])
+    surface_index = np.repeat(np.arange(len(each), dtype=np.int32), [len(part) for part in each])
     normal = np.stack([triangle[:, 4] * triangle[:, 8] - triangle[:, 5] * triangle[:, 7],
                        triangle[:, 5] * triangle[:, 6] - triangle[:, 3] * triangle[:, 8],
                        triangle[:, 3] * triangle[:, 7] - triangle[:, 4] * triangle[:, 6]], axis=1)  # fmt: skip
     sound = np.sqrt((normal * normal).sum(axis=1)) > AREA_MIN_M2
-    triangle, whose = triangle[sound], whose[sound]
+    triangle, surface_index = triangle[sound], surface_index[sound]
     corners = corners_of(triangle)
     tree = tree_over(corners.min(axis=1), corners.max(axis=1))
-    return Sheet(triangle, _rim(corners), whose, tree)
+    return Sheet(triangle, _rim(corners), surface_index, tree)
 
 
 def placed(surface: Any) -> Array:
@@ -211,15 +211,15 @@ def outline_of(surface: Any) -> list[list[float]]:
     points = np.unique(np.round(corners_of(placed(surface))[..., :2].reshape(-1, 2), 2), axis=0).tolist()
 
     def chain(ordered: Iterable[list[float]]) -> list[list[float]]:
-        kept: list[list[float]] = []
+        hull: list[list[float]] = []
         for x, y in ordered:
-            while len(kept) > 1:
-                (ax, ay), (bx, by) = kept[-2:]
+            while len(hull) > 1:
+                (ax, ay), (bx, by) = hull[-2:]
                 if (bx - ax) * (y - ay) > (by - ay) * (x - ax):
                     break
-                kept.pop()
-            kept.append([x, y])
-        return kept
+                hull.pop()
+            hull.append([x, y])
+        return hull
 
     return [*chain(points)[:-1], *chain(reversed(points))[:-1]]
 
@@ -232,8 +232,8 @@ def _rim(corners: Array) -> NDArray[np.int8]:
     _, number = np.unique(np.rint(corners.reshape(-1, 3) / WELD_M), axis=0, return_inverse=True)
     number = number.reshape(count, 3)
     edges = np.sort(np.stack([number, np.roll(number, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
-    _, which, uses = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
-    alone = uses[which.ravel()] == 1
+    _, indices, uses = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    alone = uses[indices.ravel()] == 1
     on_rim = np.zeros(number.max() + 1, dtype=bool)
     on_rim[edges[alone].ravel()] = True
     return np.concatenate([alone.reshape(count, 3), on_rim[number]], axis=1).astype(np.int8)
@@ -279,26 +279,26 @@ def nearest_points(sheet: Held, p_W: ArrayLike, far_m: ArrayLike) -> tuple[Array
     If no point is closer than `far_m`, return `far_m` and the given point instead.
     """
     points = np.ascontiguousarray(p_W, dtype=float).reshape(-1, 3)
-    least, found = np.array(np.broadcast_to(far_m, len(points)), dtype=float), np.empty_like(points)
-    _find_nearest(sheet, points, least, found)
-    return least, found
+    distances, positions = np.array(np.broadcast_to(far_m, len(points)), dtype=float), np.empty_like(points)
+    _find_nearest(sheet, points, distances, positions)
+    return distances, positions
 
 
 @kernel()
-def _find_nearest(held: Held, points: NDArray, least: NDArray, found: NDArray) -> None:
-    """Fill `found` (P, 3) with the points nearest to `points`, and lower the limits `least` (P,) to their distances."""
+def _find_nearest(held: Held, points: NDArray, distances: NDArray, positions: NDArray) -> None:
+    """Fill `positions` (P, 3) with the points nearest to `points`, and reduce the limits `distances` (P,) to theirs."""
     for k in range(points.shape[0]):
-        nearest = nearest_point(held.content, (points[k, 0], points[k, 1], points[k, 2]), least[k])
-        least[k] = nearest.distance
+        nearest = nearest_point(held.content, (points[k, 0], points[k, 1], points[k, 2]), distances[k])
+        distances[k] = nearest.distance
         for axis in range(3):
-            found[k, axis] = nearest.point[axis]
+            positions[k, axis] = nearest.point[axis]
 
 
 @noinline
 def nearest_point(sheet: Sheet, x: Vector, far: float) -> Nearest:
     """Return the point nearest to x if closer than `far` [m]; of equally near points, the first found."""
     tree = sheet.tree
-    best, which, feature, point = far * far, -1, FACE, x
+    best, index, feature, point = far * far, -1, FACE, x
     if tree.bounds.shape[0] > 0 and _square(tree.bounds[0], x) < best:
         tree.waiting[0], tree.away[0], depth = 0, 0.0, 1
         while depth > 0:
@@ -308,25 +308,25 @@ def nearest_point(sheet: Sheet, x: Vector, far: float) -> Nearest:
                 continue
             first, parts = tree.link[node, 0], tree.link[node, 1]
             if parts == 0:
-                near, other = node + 1, first
-                at, beyond = _square(tree.bounds[near], x), _square(tree.bounds[other], x)
+                closer, other = node + 1, first
+                at, beyond = _square(tree.bounds[closer], x), _square(tree.bounds[other], x)
                 if beyond < at:
-                    near, other, at, beyond = other, near, beyond, at
+                    closer, other, at, beyond = other, closer, beyond, at
                 if beyond < best:
                     tree.waiting[depth], tree.away[depth] = other, beyond
                     depth += 1
                 if at < best:
-                    tree.waiting[depth], tree.away[depth] = near, at
+                    tree.waiting[depth], tree.away[depth] = closer, at
                     depth += 1
                 continue
             for n in range(first, first + parts):
                 t = tree.part[n]
-                found, of = nearest_on(sheet.triangle[t], x)
-                away = subtract(x, found)
+                candidate, candidate_feature = nearest_on(sheet.triangle[t], x)
+                away = subtract(x, candidate)
                 square = dot(away, away)
                 if square < best:
-                    best, which, feature, point = square, t, of, found
-    return Nearest(math.sqrt(best) if which >= 0 else far, which, feature, point)
+                    best, index, feature, point = square, t, candidate_feature, candidate
+    return Nearest(math.sqrt(best) if index >= 0 else far, index, feature, point)
 
 
 @inlined
@@ -367,8 +367,8 @@ def _square(bounds: NDArray, x: Vector) -> float:
     """Return the squared distance of a point from a box [m^2]."""
     square = 0.0
     for k in range(3):
-        over = max(bounds[k] - x[k], x[k] - bounds[k + 3], 0.0)
-        square += over * over
+        excess = max(bounds[k] - x[k], x[k] - bounds[k + 3], 0.0)
+        square += excess * excess
     return square
 
 
@@ -401,11 +401,11 @@ def crosses(sheet: Sheet, start: Vector, end: Vector) -> bool:
 
 @inlined
 def _crosses_one(row: NDArray, start: Vector, end: Vector) -> bool:
-    (was, normal), (now, _) = side_of(row, start), side_of(row, end)
-    if (was >= 0.0) == (now >= 0.0):
+    (side_start, normal), (side_end, _) = side_of(row, start), side_of(row, end)
+    if (side_start >= 0.0) == (side_end >= 0.0):
         return False
     ab, ac = (row[3], row[4], row[5]), (row[6], row[7], row[8])
-    at = subtract(axpy(start, was / (was - now), subtract(end, start)), (row[0], row[1], row[2]))
+    at = subtract(axpy(start, side_start / (side_start - side_end), subtract(end, start)), (row[0], row[1], row[2]))
     square = dot(normal, normal)
     u, v = dot(cross(at, ac), normal) / square, dot(cross(ab, at), normal) / square
     return u >= -EDGE and v >= -EDGE and u + v <= 1.0 + EDGE

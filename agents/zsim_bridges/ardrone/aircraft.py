@@ -1,9 +1,9 @@
 """One drone of a run presented as an AR.Drone 2.0: messages and datagrams in, commands and datagrams out. Pure.
 
 `Aircraft` stands between the run and pilots' programs, and holds the aircraft's configuration, watchdogs and state.
-`Pilot` carries out the programs' REF and PCMD: it requests a mode until it is entered, and repeats a setpoint while it
-is in force; `SetpointSender` converts setpoints for the drone. Source: AR.Drone Developer Guide SDK 2.0, 6.6; datagrams
-of existing clients.
+`Pilot` carries out the programs' REF and PCMD: it requests a mode until this is entered or abandoned, and repeats a
+setpoint while it is in force; `SetpointSender` converts setpoints for the drone. Source: AR.Drone Developer Guide SDK
+2.0, 6.6; datagrams of existing clients.
 """
 
 import math
@@ -31,7 +31,7 @@ from zsim_bridges.ardrone.navdata import (
 )
 from zsim_bridges.vehicle_links.drone_link import REPEAT_NS, CommandSender, ModeName, OnboardState
 
-WATCHDOG_NS = 50_000_000  # time without an AT command until the watchdog bit is set (Developer Guide 6.6, COMWDG)
+WATCHDOG_NS = 50_000_000  # time without an AT command after which the watchdog bit is set (Developer Guide 6.6, COMWDG)
 LAND_AFTER_NS = 2_000_000_000  # time of hovering without a pilot's program after which the drone lands
 MALFORMED_REPORTED_MAX = 20  # number of invalid parts of datagrams reported in full; further ones are only counted
 LOW_BATTERY_PERCENT = 10.0  # %; zsim's firmware does not take off below this, and lands below 5 %
@@ -140,7 +140,7 @@ class Aircraft:
             self.pilot.land()
 
     def _silence_ns(self) -> int:
-        """Return the time since the last AT command, less one gate, the resolution of arrival times [ns]."""
+        """Return the time [ns] since the last AT command (0 before one), less one gate, the resolution of arrivals."""
         return 0 if self._command_ns is None else max(0, self._now_ns - self._command_ns - self._gate_ns)
 
     # Pilots' programs
@@ -155,7 +155,7 @@ class Aircraft:
             self._malformed += 1
             self._refuse(refusal if self._malformed <= MALFORMED_REPORTED_MAX else "more data that are not AT commands")
         for command in commands:
-            # a program may restart its sequence numbers at 0 or 1 at any time, and anywhere after a silence
+            # a program may restart its sequence numbers at 0 or 1 at any time, and at any number after a silence
             if command.sequence > self._last_sequence or command.sequence in (0, 1) or self._is_lost:
                 self._last_sequence = command.sequence
                 self._command_ns, self._is_lost = self._now_ns, False
@@ -326,9 +326,9 @@ class Pilot:
     # Commands
 
     def on_ref(self, ref: Ref) -> None:
-        """Take off or land, and toggle the emergency.
+        """Take off or land, and toggle the emergency state.
 
-        A pilot's program sends the levels of both bits again and again; rising edges trigger a take-off and the toggle.
+        A pilot's program sends the levels of both bits repeatedly; rising edges trigger a take-off and the toggle.
         """
         is_take_off_edge = ref.takes_off and not self._last_take_off_bit
         is_emergency_edge = ref.emergency and not self._last_emergency_bit
@@ -436,7 +436,7 @@ class Pilot:
             self._sender.send_mode(self._now_ns, mode)
 
     def _follow(self, setpoint: TiltSetpoint) -> None:
-        """Set the setpoint, and send it at once if it differs from the last one."""
+        """Set the setpoint, which is due at once if it differs from the last one, and send it if it is due."""
         if setpoint != self.setpoint:
             self.setpoint, self._sent_ns = setpoint, None
         self._send_due()

@@ -52,7 +52,7 @@ CONFIG_NS = 500_000_000  # time without an acknowledgement after which an entry 
 WATCHDOG_NS = 1_000_000_000  # period of watchdog resets: half of the aircraft's com_watchdog
 RESTART_DROP_MIN = 100  # packets; a sequence number that falls by at least this much shows a restart of the aircraft
 PERIOD_NS = 30_000_000  # maximum time between commands (Developer Guide, 6.3)
-CHANGE_INTERVAL_NS = 15_000_000  # minimum time between changed demands; design choice: below a gate (one command each)
+CHANGE_INTERVAL_NS = 15_000_000  # minimum time between changed demands; design choice: below a gate (one demand each)
 PULSE_NS = 90_000_000  # duration of an emergency pulse: three datagrams carry the bit, so two of them may be lost
 # Minimum time between emergency pulses: longer than one takes to show in navdata, since a second would undo the first
 PULSE_INTERVAL_NS = 400_000_000
@@ -74,7 +74,7 @@ OPTIONS_MASK = sum(1 << tag for tag in (*FULL_TAGS, GPS_TAG))
 SONAR_MM = range(30, 6000)  # valid readings; any other value means that there was no echo
 GPS_1_S = 0.1  # rate at which the position follows the GPS; design choice: reduces 2 m of noise at 5 Hz to 0.3 m
 YAW_1_S = 0.1  # rate at which the heading follows the magnetometer
-GAP_S_MAX = 0.5  # gap in navdata from which on the velocity is not integrated
+GAP_S_MAX = 0.5  # gap in navdata at or above which the velocity is not integrated
 
 
 # Limits set in the aircraft: the SDK's outdoor tilt and climb rate, and its indoor yaw rate
@@ -195,7 +195,8 @@ class AircraftSession(VehicleSession):
 class FlightCommands:
     """Generates the AT commands that make one aircraft carry out demands; sequence numbers are left at 0.
 
-    REF commands a take-off or a landing, and is repeated while that is demanded; PCMD is sent at least every 30 ms.
+    REF commands a take-off, a landing or an emergency pulse, and is repeated while that is demanded; from take-off to
+    landing, PCMD accompanies it at least every 30 ms.
     Source: AR.Drone Developer Guide SDK 2.0, chapter 6.
     """
 
@@ -253,7 +254,7 @@ class _Axis:
     """A velocity loop along one axis of W, around the aircraft's own tilt loop.
 
     The velocity follows a reference that approaches the demand with a lag. The measured velocity responds to the
-    reference of ANSWER_NS ago; any deviation from that is attributed to wind, and is integrated.
+    reference of RESPONSE_NS ago; any deviation from that is attributed to wind, and is integrated.
     """
 
     def __init__(self) -> None:
@@ -263,7 +264,7 @@ class _Axis:
         self._references: deque[tuple[int, float]] = deque()
 
     def accel(self, now_ns: int, demanded: float, measured: float, max_m_s2: float) -> float:
-        """Return the acceleration [m/s^2] that the tilt must produce; from `max_m_s2` on, wind is not integrated."""
+        """Return the acceleration [m/s^2] that the tilt must produce; wind is integrated only below `max_m_s2`."""
         dt_s = 0.0 if self._last_ns is None else min(STEP_S_MAX, (now_ns - self._last_ns) * 1e-9)
         if self._last_ns is None:
             self._reference = measured

@@ -35,13 +35,13 @@ BACKLOG_MAX = 500_000  # unsent bytes, a few seconds of video, beyond which a co
 NOT_PERMITTED = (errno.EACCES, errno.EPERM)  # errors of opening a port below 1024 without the privilege to do so
 CONNECTIONS_MAX = 8  # maximum simultaneous connections per port; design choice: a pilot's program needs only one
 LINE_MAX = 512  # maximum length of a line [bytes]
-CONNECTION_ERRORS = (OSError, EOFError, TimeoutError, ValueError)  # errors of a broken connection or an overlong line
+CONNECTION_ERRORS = (OSError, EOFError, TimeoutError, ValueError)  # broken or idle connection, or overlong line
 Address = tuple[str, int]
 Refuse = Callable[[str], None]
 Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 VERSION_PORT, FILES_PORT = 5551, 21  # TCP ports for FTP: of the version, and of videos (ARDroneLib, config.h)
 VERSION_FILES = {"version.txt": b"2.4.8\r\n"}  # the newest firmware of an AR.Drone 2.0
-DATA_TIMEOUT_S = 10.0  # wall time within which a client must open the data connection
+DATA_TIMEOUT_S = 10.0  # maximum wall time that a data connection waits for its command, or a command for its transfer
 IDLE_TIMEOUT_S = 300.0  # wall time without a command after which a connection is closed
 _FIXED_REPLIES = {
     "USER": "230 logged in",

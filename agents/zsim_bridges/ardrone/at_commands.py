@@ -34,7 +34,7 @@ IGNORED_NAMES = frozenset(
 
 
 class Ref(NamedTuple):
-    """Take off or land, and toggle the emergency."""
+    """Take off or land, and toggle the emergency state."""
 
     sequence: int
     bits: int
@@ -156,7 +156,7 @@ COMMAND_TYPES: dict[str, type[Any]] = {
     "ANIM": Animation,
 }
 _COMMAND_NAMES = {kind: name for name, kind in COMMAND_TYPES.items()}
-_TYPE_NAMES = {int: "an integer", float: "a float", str: "a string"}
+_TYPE_NAMES = {int: "an integer of 32 bits", float: "a finite float of 32 bits", str: "a quoted string"}
 _BITS, _FLOAT = struct.Struct("<i"), struct.Struct("<f")
 _COMMAND = re.compile(r"AT\*([A-Z_]{1,20})=(\d{1,10})(?:,(.*))?")
 _ARGUMENT = re.compile(r'(?:"([^"]*)"|(-?\d{1,10}))(?:,|\Z)')
@@ -233,8 +233,8 @@ def _value(name: str, type_: type, argument: int | str) -> Any:
         return argument
     elif type_ is float and -(2**31) <= argument < 2**31 and math.isfinite(value := bits_to_float(argument)):
         return value
-    requirement = f"{_TYPE_NAMES[type_]}, finite, of 32 bits"
-    raise _RefusalError(f"{name} has the argument {str(argument)[:20]!r}; must be {requirement}")
+    requirement = f"must be {_TYPE_NAMES[type_]}"
+    raise _RefusalError(f"{name} has the argument {str(argument)[:20]!r}; {requirement}")
 
 
 def _quoted(part: bytes) -> str:
@@ -404,7 +404,7 @@ class Configuration:
     """The values of all entries.
 
     Args:
-        maxima: the aircraft's own maxima, by entry, where they are below the SDK's.
+        maxima: the aircraft's own maxima, by entry, to which values are limited when read.
         fixed: values specific to this aircraft, by entry.
     """
 
@@ -494,18 +494,18 @@ class Configuration:
             identifier = value[1:]
             deleted = [each for each in self._values_by_id[level] if each != DEFAULT_ID and identifier in ("all", each)]
             if not deleted and identifier != "all":
-                raise ConfigurationError(f"there is no configuration {identifier[:40]!r} at the level {level}")
+                raise ConfigurationError(f"there is no configuration {identifier[:40]!r} at the {level} level")
             for each in deleted:
                 del self._values_by_id[level][each], self._descriptions[level][each]
             if self._current_ids[level] not in self._values_by_id[level]:
                 self._current_ids[level] = DEFAULT_ID
         else:
             if not _ID.fullmatch(value):
-                raise ConfigurationError(f"the identifier {value[:40]!r} must consist of at most 32 letters and digits")
+                raise ConfigurationError(f"the identifier {value[:40]!r} must consist of 1 to 32 letters and digits")
             if value not in self._values_by_id[level]:
                 if len(self._values_by_id[level]) >= CONFIGURATIONS_MAX:
                     raise ConfigurationError(
-                        f"there are {CONFIGURATIONS_MAX} configurations at the level {level}; delete some"
+                        f"there are {CONFIGURATIONS_MAX} configurations at the {level} level; delete some"
                     )
                 self._values_by_id[level][value], self._descriptions[level][value] = {}, ""
             self._current_ids[level] = value

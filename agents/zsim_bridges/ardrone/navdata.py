@@ -229,7 +229,7 @@ def unpack(datagram: bytes) -> Navdata:
             raise NavdataError("has no checksum")
         tag, size = OPTION_HEADER.unpack_from(datagram, offset)
         if size < OPTION_HEADER.size or offset + size > len(datagram):
-            beyond = f"beyond the packet's {len(datagram)} bytes"
+            beyond = f"which is below 4 or beyond the packet's {len(datagram)} bytes"
             raise NavdataError(f"option {tag} at byte {offset} has the size {size}, {beyond}")
         if tag == CHECKSUM_TAG:
             if size != _CHECKSUM.size:

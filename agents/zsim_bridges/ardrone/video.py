@@ -90,7 +90,7 @@ class VideoEncoder:
         self._count = 0
 
     def encode(self, jpeg: bytes, force_idr: bool) -> VideoFrame | None:
-        """Return the frame of a JPEG image, None if the encoder returns no data; `force_idr`: decoding can begin here.
+        """Return the frame of a JPEG image, None if the encoder returns no data; `force_idr`: decoding can begin at it.
 
         Raises:
             VideoError: the data are not a readable JPEG.

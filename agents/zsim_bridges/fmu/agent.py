@@ -27,7 +27,8 @@ from zsim_bridges.fmu.model import FmuInstance, FmuModel, Inputs, Variable
 Frame = Literal["heading", "world"]
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 COVARIANCE = tuple(float(i == j) for i in range(6) for j in range(6))
-# Defaults of fields that an FMU may omit, by message. If it provides only some elements of a vector, the others are 0.
+# Defaults of fields that an FMU may omit, by message. If it provides only some elements of a vector, the others keep
+# their defaults, or are 0 without one.
 DEFAULTS: dict[str, dict[str, Any]] = {
     "velocity": {"velocity_m_s": (0.0, 0.0, 0.0), "yaw_rate_rad_s": 0.0},
     "attitude": {"orientation_wxyz": LEVEL, "yaw_rate_rad_s": 0.0},
@@ -90,7 +91,7 @@ class Fmu:
         """Return the agent that runs the FMU.
 
         Raises:
-            RunError: the file, its variables or the mapping cannot be used.
+            RunError: the file, its variables, the mapping, the drone or the period cannot be used.
         """
         return FmuAgent(self, info, scenario)
 
@@ -184,7 +185,7 @@ class FmuAgent(Agent):
         return outputs
 
     def _input_values(self) -> Inputs:
-        """Return values for the inputs whose messages have arrived; the other inputs keep their start values."""
+        """Return values for the inputs whose messages have arrived; the other inputs keep the values they have."""
         values = []
         for link in self._inputs:
             place = link.place
@@ -267,7 +268,7 @@ class _Writer:
             mapped_count = sum(link.place.size for link in self.links if link.place.field == field)
             if mapped_count < sizes[field]:
                 raise RunError(
-                    f"{self.key}: {mapped_count} of {sizes[field]} values of {field} are mapped; must be all"
+                    f"{self.key}: {mapped_count} of {sizes[field]} values of {field} are mapped; all must be"
                 )
 
     def outputs(self, agent: FmuAgent, t_ns: int, values: Sequence[Sequence[Any]]) -> list[Output]:

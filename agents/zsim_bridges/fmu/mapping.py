@@ -46,7 +46,7 @@ UNITS = {
     "_ut": Unit("uT", (1, 0, -2, -1, 0, 0, 0, 0), 1e-6),
     "_ns": Unit("ns", (0, 0, 1, 0, 0, 0, 0, 0), 1e-9),
 }
-# The kinds of value that a receiver of each kind accepts
+# The kinds of value that a receiver of each kind accepts; a boolean field also accepts an FMU's numbers (true if > 0)
 ACCEPTED_KINDS: dict[Kind, tuple[Kind, ...]] = {
     "number": ("number", "integer", "boolean"),
     "integer": ("integer", "boolean"),

@@ -46,7 +46,7 @@ Inputs = Iterable[tuple["Variable", Values]]
 ALLOWED = "must be an FMU of FMI 2 or 3 for co-simulation"
 WARNING, FATAL = 1, 4  # statuses of FMI 2 and 3; those above a warning are failures
 LABELS = ("ok", "warning", "discard", "error", "fatal", "pending")  # names of the statuses, by number
-LINES_KEPT = 5  # number of the FMU's last log lines quoted with a failure
+LINES_KEPT = 5  # number of the FMU's last warnings and errors that are quoted with a failure
 NAMED_MAX = 10  # number of variables that an error lists
 BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 # For each FMI version and type: the kind of value, and the suffix of FMPy's methods get… and set…
@@ -346,7 +346,7 @@ def _read_description(path: Path) -> Any:
     if str(description.fmiVersion).partition(".")[0] not in ("2", "3"):
         raise RunError(f"{path}: is for FMI {description.fmiVersion}; {ALLOWED}")
     if description.coSimulation is None:
-        raise RunError(f"{path}: is for model exchange only; export it for co-simulation")
+        raise RunError(f"{path}: does not support co-simulation; export it for co-simulation")
     return description
 
 

@@ -73,7 +73,7 @@ class Flight:
 
     def refusal(self) -> str | None:
         if self._state.status is None:
-            return "no status of the drone yet"
+            return "no status from the drone yet"
         if self.foreign_commander:
             return f"flown by {self.foreign_commander}"
         return "emergency: rotors are stopped; reboot" if self._state.state == "emergency" else None
@@ -99,11 +99,11 @@ class Flight:
             return None
         if force:
             self.terminate()
-        return None if force else "in flight; land first, or force"
+        return None if force else "in flight; land first, or force disarming"
 
     def terminate(self) -> None:
         """Stop the rotors at once, regardless of the commander."""
-        self.mission.abort("a client stopped its rotors", failsafe=False)
+        self.mission.abort("a client stopped the rotors", failsafe=False)
         self._control.send_mode("emergency")
         self._end_flight("Emergency: rotors stopped")
 
@@ -136,7 +136,7 @@ class Flight:
         if reason and (self._state.is_airborne or self.foreign_commander):
             return reason
         if self._state.state == "landing" and mode is not FlightMode.LAND:
-            return "landing; it ends on the ground"
+            return "landing; the mode can be changed only after touchdown"
         return self._enter(mode)
 
     def go_to(self, target: Target) -> str | None:
@@ -149,7 +149,7 @@ class Flight:
         return reason
 
     def set_point(self, target: Target | TiltTarget) -> str | None:
-        """Accept a setpoint from a stream; in OFFBOARD (GUIDED) it is followed at once."""
+        """Accept a setpoint from a stream; in OFFBOARD (GUIDED) it is followed at once, unless a climb is under way."""
         self._setpoint_ns = self._state.t_ns
         if self.mode is not FlightMode.OFFBOARD:
             return None if self._personality.is_px4 else "not in GUIDED"
@@ -157,7 +157,7 @@ class Flight:
         if reason is None and self._control.climb_to_m is None:
             self._control.hold(target)
             if isinstance(target, Target) and self._is_armed and not self._state.is_airborne:
-                z = target.position_m[2]  # only a target above the vehicle starts a take-off
+                z = target.position_m[2]  # only a target above, or an upward velocity, starts a take-off
                 if target.velocity_m_s[2] > 0.0 or (
                     z is not None and z > self._state.position_m[2] + CLIMB_TOLERANCE_M
                 ):
@@ -351,15 +351,15 @@ class FlightControl:
         return any(target.velocity_m_s) or (target.yaw_rad is None and target.yaw_rate_rad_s != 0.0)
 
     def hold(self, target: Target | TiltTarget) -> None:
-        """Hold a target from now on, and send it at once, unless a climb under way has to end first."""
+        """Hold a target from now on, and send it at once if the firmware, the climb and the allowance permit this."""
         self.target = target
         if self._state.is_steerable and self.climb_to_m is None:
-            self._is_pending = self._allowance <= BURST_MAX // 10  # the rest is reserved for repetitions
+            self._is_pending = self._allowance <= BURST_MAX // 10  # the last tenth is for repetitions
             if not self._is_pending:
                 self._send()
 
     def hold_position(self) -> None:
-        """Come to rest, cancelling anything in progress."""
+        """Come to rest, cancelling a climb under way."""
         self.climb_to_m = None
         if self._state.is_steerable:
             self.hold(Target(self._course.stop(*self._motion())))
@@ -400,7 +400,7 @@ class FlightControl:
         self._sender.send_mode(self._state.t_ns, mode)
 
     def is_takeoff_overdue(self) -> bool:
-        """Return whether the drone is still on the ground although a take-off was requested."""
+        """Return whether the drone is still on the ground RESPONSE_TIMEOUT_NS after a take-off was requested."""
         if self.pending_mode is None or self.pending_mode[0] != "takeoff" or self._state.is_airborne:
             return False
         return self._state.t_ns - self.pending_mode[1] > RESPONSE_TIMEOUT_NS

@@ -39,7 +39,7 @@ class VehicleState:
 
     Attributes:
         t_ns: simulated time of the newest status.
-        position_m, velocity_m_s: in W; q_WB, rate_rad_s: attitude, and angular rate in B.
+        position_m, velocity_m_s: in W; q_WB, rate_rad_s: attitude, and angular rate in the IMU's axes.
         is_estimated: whether position, velocity and attitude are the estimator's.
         sigma_m: standard deviations of the horizontal and the vertical position; 0 for the truth.
         samples: newest sample of each sensor, by name.

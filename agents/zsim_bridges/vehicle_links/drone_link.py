@@ -70,7 +70,8 @@ class OnboardState:
     The arguments are the poses of the IMU and the magnetometer in the body.
 
     Attributes:
-        imu, mag, baro, flow, status, estimate: newest message of each kind, in body axes; None before the first.
+        imu, mag, baro, flow, status: newest message of each kind, in body axes; None before the first.
+        estimate: newest estimate that has an attitude; None before the first.
         attitude: B to W.
         altitude_m: height above ground, from the sonar; beyond its range, continued by the barometer.
         position_m: horizontal position integrated since the start, and the altitude.

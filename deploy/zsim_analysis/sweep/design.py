@@ -24,7 +24,7 @@ from zsim.math.randomness import stream
 from zsim.scenario import scenario_file
 from zsim.scenario.roles import check_alone, check_pace
 from zsim.scenario.scenario import Scenario
-from zsim.scenario.scenario_file import EXAMPLE, NOTHING, steps_of, whole_path
+from zsim.scenario.scenario_file import EXAMPLE, NOTHING, full_path, steps_of
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import first_fault, first_lines, show
 from zsim_agents.hosting import check_classes
@@ -67,7 +67,7 @@ def difference(old: SweepPlan, new: SweepPlan) -> str | None:
     fields = []  # for each plan: values by path from the top of the scenario
     for plan in (old, new):
         parts = [text.partition("=") for text in plan.vary]
-        fields.append({whole_path(path.strip(), plan.document): values for path, _, values in parts})
+        fields.append({full_path(path.strip(), plan.document): values for path, _, values in parts})
     if SEED in fields[0] and fields[1].get(SEED, "").startswith(f"{fields[0][SEED]},"):
         fields[1][SEED] = fields[0][SEED]  # the same seeds, followed by further ones
     if list(fields[0].items()) != list(fields[1].items()):
@@ -162,7 +162,7 @@ def parse(text: str, document: Mapping[str, Any] = NOTHING) -> Axis:
         return Seeds()
     if not equals or not path.strip():
         raise ValueError(f"is not a variation; must be {SYNTAX}")
-    path = whole_path(path.strip(), document)
+    path = full_path(path.strip(), document)
     if path == SEED and values.strip() == PAIRED:
         return Seeds(paired=True)
     if path == SEED:

@@ -19,7 +19,7 @@ from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.consistency import unflown_plans
 from zsim.scenario.scenario import DRONES_MAX, Scenario
-from zsim.scenario.scenario_file import whole_path
+from zsim.scenario.scenario_file import full_path
 from zsim.schema.checker import FAULTS_MAX
 from zsim.schema.quantities import G_M_S2
 from zsim.schema.yaml_file import FILE_SIZE_MAX
@@ -248,7 +248,7 @@ def test_overrides_apply_in_order():
     ],
 )
 def test_section_names_may_be_omitted(path: str, whole: str):
-    assert whole_path(path) == whole
+    assert full_path(path) == whole
 
 
 @pytest.mark.parametrize(
@@ -261,12 +261,12 @@ def test_section_names_may_be_omitted(path: str, whole: str):
     ],
 )
 def test_the_only_entry_of_a_list_need_not_be_named(path: str, entries: list[str], whole: str) -> None:
-    assert whole_path(path, {"clusters": [{"name": name} for name in entries]}) == whole
+    assert full_path(path, {"clusters": [{"name": name} for name in entries]}) == whole
 
 
 def test_a_field_of_several_entries_is_refused_with_an_example_path() -> None:
     with pytest.raises(ValueError, match=r"2 clusters.*clusters\.left\.gains\.proportional_1_s"):
-        whole_path("gains.proportional_1_s", {"clusters": [{"name": "left"}, {"name": "right"}]})
+        full_path("gains.proportional_1_s", {"clusters": [{"name": "left"}, {"name": "right"}]})
     assert scenario_file.load(STEP, ["gains.proportional_1_s=0.4"]).clusters[0].gains.proportional_1_s == 0.4
 
 

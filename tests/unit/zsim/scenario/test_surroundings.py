@@ -260,6 +260,6 @@ def test_least_distances_match_nearest_even_when_computed_in_blocks(monkeypatch:
     ]
     points = np.random.default_rng(1).uniform((-4, -4, 0), (4, 4, 4), (200, 3))
     expected = [min(nearest(row_of(each), *point)[0] for each in solids) for point in points.tolist()]
-    np.testing.assert_allclose(surroundings.least_distances(solids, points), expected, atol=1e-12)
+    np.testing.assert_allclose(surroundings.min_distances(solids, points), expected, atol=1e-12)
     assert min(expected) < 0.0
-    assert surroundings.least_distances([], points).min() == np.inf
+    assert surroundings.min_distances([], points).min() == np.inf
