@@ -1,9 +1,9 @@
-"""Measure the parts of the benchmarks, and write the results to benchmarks/README.md.
+"""Measure the parts of the benchmarks; write the results to benchmarks/results and benchmarks/README.md.
 
 make bench                                        all parts; creates the peers' environment first
 .venv/bin/python -m benchmarks a b --repeats 7    some parts
 .venv/bin/python -m benchmarks c --against REV    this working tree against another commit
-.venv/bin/python -m benchmarks a --page           rewrite the page from results/a.json, without measuring
+.venv/bin/python -m benchmarks a --page           rewrite a section of the page from results/a.json, without measuring
 """
 
 import argparse
@@ -43,7 +43,7 @@ BESIDE = frozenset("abf")  # parts that compare zsim with peers
 
 
 class Part(NamedTuple):
-    """A part of the benchmarks: `measure` fills a sheet with a number of repeats, `page` renders it as Markdown."""
+    """A part of the benchmarks: `measure` returns a sheet with a number of repeats, `page` renders it as Markdown."""
 
     measure: Callable[[int], Sheet]
     page: Callable[[Sheet], str]
@@ -66,13 +66,17 @@ PARTS = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"one of {' '.join(PARTS)}; all if none is given")
-    parser.add_argument("--repeats", type=int, default=5, help="of every measurement; medians are reported (5)")
+    parser.add_argument("--repeats", type=int, default=5, help="number of repeats of every measurement (5)")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON files")
-    parser.add_argument("--page", action="store_true", help="measure nothing; write the page from the JSON files")
-    parser.add_argument("--no-page", action="store_true", help="leave benchmarks/README.md and its pictures alone")
+    parser.add_argument("--page", action="store_true", help="measure nothing; rewrite sections from the JSON files")
+    parser.add_argument("--no-page", action="store_true", help="leave benchmarks/README.md alone; draw pictures")
     parser.add_argument("--against", metavar="REV", help="with only part c: measure this tree and a commit in turn")
     parser.add_argument(
-        "--of", nargs="+", choices=against.FLIGHTS, default=list(against.FLIGHTS), help="with --against: its flights"
+        "--of",
+        nargs="+",
+        choices=against.FLIGHTS,
+        default=list(against.FLIGHTS),
+        help="with --against: flights to make (all)",
     )
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # so that contenders are terminated too
@@ -111,7 +115,7 @@ def _measured(name: str, part: Part, repeats: int, path: Path) -> Sheet:
 def _where(sheet: Sheet) -> str:
     """Describe when, where and with what a sheet was measured."""
     others = ", ".join(f"{name} {version}" for name, version in sheet.machine["peers"].items())
-    peers_told = f" Beside it: {others}." if others else ""
+    peers_told = f" Peers: {others}." if others else ""
     repeats = sheet.machine["repeats"]
     return f"{line(sheet.machine)}{peers_told} Medians of {repeats} (least to greatest)."
 

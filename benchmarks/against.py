@@ -42,7 +42,7 @@ class Flight(NamedTuple):
 
 FLIGHTS = {
     **{name: Flight(f"Test 1, {label}", 3, OPTIONS[name], 10.0, 330.0) for name, label in LABELS.items()},
-    # 4 s: the grid takes off at 1 s, and all its formations are engaged by then
+    # the grid takes off at 1 s, and all its formations are engaged by 4 s
     "grid": Flight(f"{GRID} drones, one process (`--in-process`)", GRID, ("--in-process",), 4.0, 14.0),
 }
 QUANTITIES = {"factor": "× real time", "cpu": "CPU ms per drone-second", "peak": "greatest resident memory, MB"}
@@ -64,7 +64,8 @@ def measure(repeats: int, revision: str, names: Sequence[str] = tuple(FLIGHTS)) 
         names: keys of `FLIGHTS`.
 
     Raises:
-        RefusedError: git does not know the revision, or a package that it needs cannot be installed.
+        RefusedError: git does not know the revision, a package that it needs cannot be installed, or a revision's first
+            flight fails.
     """
     sheet = Sheet("c-against", "")
     flights = {name: FLIGHTS[name] for name in FLIGHTS if name in names}
@@ -87,7 +88,7 @@ def measure(repeats: int, revision: str, names: Sequence[str] = tuple(FLIGHTS)) 
 
 @contextlib.contextmanager
 def checked_out(revision: str, folder: Path) -> Iterator[Side]:
-    """Check a revision out with an environment that shares the installed packages; remove the checkout at the end.
+    """Check out a revision, with an environment that shares the installed packages; remove the checkout at the end.
 
     Raises:
         RefusedError: git does not know the revision, or a package that it needs cannot be installed.
@@ -102,7 +103,7 @@ def checked_out(revision: str, folder: Path) -> Iterator[Side]:
 
 
 def _environment(root: Path, folder: Path) -> Path:
-    """Make an environment with zsim from a checkout and the current environment's packages; return its Python."""
+    """Make an environment with zsim from a checkout, the current packages and those it lacks; return its Python."""
     project = tomllib.loads((root / "pyproject.toml").read_text())
     ours = project["tool"]["hatch"]["build"]["dev-mode-dirs"]
     shared = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
@@ -150,7 +151,7 @@ def described(root: Path) -> str:
 
 
 def _measured(sheet: Sheet, mine: str, name: str, flight: Flight, side: Side, path: Path) -> str:
-    """Make a short and a long flight, add the results to the sheet, and return them as text."""
+    """Make a short and a long flight, add the results, or why a flight failed, to the sheet; return them as text."""
     try:
         _, short_cpu_s, _ = _flown(side, flight, flight.short_s, path)
         factor, long_cpu_s, peak_mb = _flown(side, flight, flight.long_s, path)

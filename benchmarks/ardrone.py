@@ -4,7 +4,7 @@
 
 The world runs in realtime; each drone has a pilot that receives full navdata and sends REF and PCMD every 30 ms, as the
 SDK does. The age is measured from sending a PCMD that differs from the last one to the arrival of the command at a
-Zenoh client; for comparison, a message of the same size is timed from one Zenoh client to another.
+Zenoh client; for comparison, a message of 100 bytes is timed from one Zenoh client to another.
 """
 
 import argparse
@@ -66,7 +66,7 @@ class Pilots:
         self._socket.sendto(datagram, (address, at_commands.PORT))
 
     def steer(self, share: float = 0.0, only: str = "") -> None:
-        """Send the REF and PCMD that the SDK sends every 30 ms; `share` is the pitch, from -1 to 1."""
+        """Send the REF and PCMD that the SDK sends every 30 ms; `share` is the pitch over its limit, from -1 to 1."""
         for address in [only] if only else self.addresses:
             pcmd = at_commands.Pcmd(0, int(share != 0.0), 0.0, share, 0.0, 0.0)
             self._send(address, at_commands.ref(0, self.flies), pcmd)
@@ -144,7 +144,7 @@ def _await_navdata(pilots: Pilots) -> None:
 
 
 def _ages_ms(session: zenoh.Session, pilots: Pilots, seconds: float) -> list[float]:
-    """Steer for `seconds`; return the time from sending each distinct command to its arrival on its key [ms]."""
+    """Steer for `seconds`; return the times from sending each timed command to its arrival on its key [ms]."""
     sent_s: dict[float, float] = {}
     ages_ms: list[float] = []
 
@@ -168,7 +168,7 @@ def _ages_ms(session: zenoh.Session, pilots: Pilots, seconds: float) -> list[flo
 
 
 def _forward(tilt_rad: float) -> float:
-    """Return the `forward` of a command, a fraction of zsim's tilt limit, by which the command is recognised."""
+    """Return the `forward` of a command, tan(tilt) / tan(zsim's tilt limit), by which the command is recognised."""
     sent = at_commands.bits_to_float(at_commands.float_to_bits(tilt_rad / INDOOR_RAD))
     return math.tan(sent * INDOOR_RAD) / math.tan(math.radians(20.0))
 

@@ -2,8 +2,8 @@
 
     python -m benchmarks.cameras [PICTURES]
 
-A front camera of 640 x 360 px sees ten drones, hovering and in motion. If a folder PICTURES is given, the pictures of
-docs/cameras.md are written to it instead.
+A front camera of 640 x 360 px sees ten drones, hovering and in motion; drawing is timed for a bottom camera, too. If a
+folder PICTURES is given, the pictures of docs/cameras.md are written to it instead.
 """
 
 import sys
@@ -27,7 +27,7 @@ ROTOR_RAD_S = 400.0  # rad/s; roughly the speed in hover
 
 
 def situation(moving: bool = False) -> DroneStates:
-    """Return the states of a drone and of ten others in front of it, 3 to 15 m away."""
+    """Return the states of a drone and of ten others, 4.2 to 15 m ahead of it."""
     rng = np.random.default_rng(3)
     ahead = np.array([0.0, *(3 + 1.2 * np.arange(1, DRONES))])
     p = np.stack([ahead, rng.uniform(-0.5, 0.5, DRONES) * ahead, 4 + rng.uniform(-0.15, 0.15, DRONES) * ahead], axis=-1)

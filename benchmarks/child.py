@@ -24,7 +24,7 @@ def result(command: Sequence[str], timeout_s: float) -> dict[str, Any]:
     """Run a command in the project's folder and return the last line of JSON that it prints.
 
     Raises:
-        RefusedError: the command failed, or did not end in time.
+        RefusedError: the command printed no line of JSON, or did not end in time.
     """
     with tempfile.TemporaryFile("w+") as errors:
         process = _started(command, errors, stdin=subprocess.DEVNULL)
@@ -41,7 +41,7 @@ def result(command: Sequence[str], timeout_s: float) -> dict[str, Any]:
 
 
 class Server:
-    """A contender that keeps running and answers one line of JSON with another."""
+    """A contender that keeps running and answers each line of JSON with another."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - stays open as long as the process runs
@@ -95,4 +95,4 @@ def _end(process: subprocess.Popen[str]) -> None:
 def _last_words(errors: Any, code: int | None) -> str:
     errors.seek(0)
     lines = [text.strip() for text in errors.read().splitlines() if text.strip()]
-    return f"exit code {code}: {lines[-1] if lines else 'it said nothing'}"[:200]
+    return f"exit code {code}: {lines[-1] if lines else 'no error output'}"[:200]

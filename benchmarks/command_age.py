@@ -1,7 +1,7 @@
 """Part d: the age of a command on arrival at the world, in realtime, since the samples that it answers were published.
 
-For comparison, bare Zenoh is timed in the same run with as many processes: a round trip, and the path of a command
-(from the hub to N clients, through the hub to one more client that waits for all of them, and back).
+For comparison, bare Zenoh is timed in the same run, with a client for each of the N drones: a round trip, and the path
+of a command (from the hub to N clients, through the hub to one more client that waits for all of them, and back).
 """
 
 import sys

@@ -131,7 +131,7 @@ def _runs(port: int) -> bool:
 
 @contextmanager
 def _flying(folder: Path, count: int) -> Iterator[tuple[int, psutil.Process]]:
-    """Fly `count` drones at 1 x real time with a console; yield its port and process."""
+    """Fly `count` drones at 1 x real time with a console; yield the console's port and process."""
     scenario, world, port = folder / f"grid{count}.yaml", free_port(), free_port()
     grid.write(scenario, count, 3600.0)
     endpoint = f"tcp/127.0.0.1:{world}"
@@ -203,7 +203,7 @@ def _measure_factors(sheet: Sheet, folder: Path, count: int) -> str:
 
 @contextmanager
 def _looked_at(endpoint: str) -> Iterator[None]:
-    """Run a console, with a client that reads everything that a page is sent."""
+    """Run a console and a client that reads everything that a page is sent."""
     port = free_port()
     with _started("console", "--connect", endpoint, "--port", str(port)):
         _await(lambda: _runs(port), "a run on the console")
@@ -244,7 +244,7 @@ def page(sheet: Sheet) -> str:
         ["one page open [% of a core]", *_cells(sheet, "read")],
         ["goal for one page [% of a core]", *(f"≤ {figure(GOALS[count])}" for count in SIZES)],
         ["sent to a page [kB/s]", *_cells(sheet, "rate")],
-        ["as fast as it goes, without [× real time]", *_cells(sheet, "without")],
+        ["as fast as it goes, without a console [× real time]", *_cells(sheet, "without")],
         ["as fast as it goes, with one page [× real time]", *_cells(sheet, "with")],
         ["ratio, window by window", *(spread(sheet.ratio("with", "without", count)) for count in SIZES)],
     ]

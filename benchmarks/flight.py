@@ -1,4 +1,4 @@
-"""Measure the CPU time of an in-process run, excluding its first simulated second; print a line of JSON.
+"""Measure an in-process run: its CPU time after the first simulated second, and its memory; print a line of JSON.
 
 .venv/bin/python -m benchmarks.flight --drones 10 --seconds 5
 """

@@ -49,7 +49,7 @@ def measure(repeats: int) -> Sheet:
 def page(sheet: Sheet) -> str:
     walls = [[name, spread(sheet.spread(name, DRONES))] for name in (COMMAND, PYTHON)]
     medians = [found.median for name in (COMMAND, PYTHON) if (found := sheet.spread(name, DRONES))]
-    ratio = f"`{PYTHON}` takes {medians[1] / medians[0]:.3f} × the command (aim: at most {RATIO_MAX:g})."
+    ratio = f"`{PYTHON}` takes {medians[1] / medians[0]:.3f} times as long as the command (aim: at most {RATIO_MAX:g})."
     steps = [[name, spread(sheet.spread(name, DRONES))] for name in STEPS]
     return "\n\n".join(
         (

@@ -1,7 +1,7 @@
-"""Scenarios with any number of drones, on a grid on the ground, each with GPS, all other sensors and an estimator.
+"""Scenarios with any number of drones on a grid on the ground, each with all sensors of the paper and an estimator.
 
-Three drones in a row do not form a triangle and would not take off, so a cluster's three drones stand at three corners
-of a square, and the squares form the grid.
+Three drones in a row do not form a triangle and would not take off, so the drones of a cluster of three stand at three
+corners of a square, and the squares form the grid.
 """
 
 import math

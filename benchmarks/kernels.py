@@ -29,9 +29,9 @@ class Contender(NamedTuple):
 NOTHING = "firmware, sensors, wind, contacts"
 CONTENDERS = {
     "zsim": Contender("zsim", None, "zsim_fleet", (), "2.5 ms, RK4", "–"),
-    "zsim_kernel": Contender("zsim, bare kernel", None, "zsim_fleet", ("--bare",), "2.5 ms, RK4", "drawing of noise"),
+    "zsim_kernel": Contender("zsim, bare kernel", None, "zsim_fleet", ("--bare",), "2.5 ms, RK4", "noise generation"),
     "pybullet": Contender(
-        "pybullet as gym-pybullet-drones", "pybullet", "pybullet_drones", (), "4.2 ms, semi-implicit Euler",
+        "PyBullet, as used by gym-pybullet-drones", "pybullet", "pybullet_drones", (), "4.2 ms, semi-implicit Euler",
         "firmware, sensors, wind, rotor lag"),
     "rotorpy": Contender(
         "RotorPy, objects", "rotorpy", "rotorpy_bodies", (), "10 ms, RK45 adaptive", NOTHING),

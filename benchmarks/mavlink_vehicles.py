@@ -4,7 +4,8 @@
 
 All drones of a realtime run fly as ArduPilot vehicles that send full-rate telemetry, each to a ground station and a
 program. A setpoint's age is the time from sending its datagram to the arrival of its command at a Zenoh subscriber; for
-comparison, a plain put on another key is timed to the same subscriber. The difference is the delay added.
+comparison, a plain put on another key is timed to a subscriber of the same session. The difference is the
+delay added.
 """
 
 import argparse
@@ -140,7 +141,7 @@ def subscribed(endpoint: str, arrivals: dict[str, list[float]]) -> zenoh.Session
 
 
 def age_ms(arrived: list[float], send: Callable[[], None]) -> list[float]:
-    """Send a message; return its age on arrival [ms], or nothing if it has not arrived when the next one is due."""
+    """Send a message; return its age on arrival [ms], or an empty list if it is not there when the next is due."""
     arrived.clear()
     sent_s = time.perf_counter()
     send()
@@ -149,7 +150,7 @@ def age_ms(arrived: list[float], send: Callable[[], None]) -> list[float]:
 
 
 def ages_ms(program: Program, ports: Ports, count: int) -> tuple[list[float], list[float]]:
-    """Return the sorted ages [ms] of setpoints at a subscriber, sent by MAVLink and by Zenoh alone."""
+    """Return the sorted ages [ms], at a subscriber, of setpoints sent by MAVLink, and of plain Zenoh messages."""
     arrivals: dict[str, list[float]] = {}
     endpoint = f"tcp/127.0.0.1:{ports.world}"
     with subscribed(endpoint, arrivals), subscribed(endpoint, {}) as other:

@@ -1,7 +1,7 @@
-"""Disk, memory and CPU needs of an estimator installed alone on an onboard computer, with and without numba.
+"""Disk, memory and CPU needs of an estimator installed alone, as on an onboard computer, with and without numba.
 
 Each variant is installed from this project into an environment of its own in .venv-bench, and estimates the state of
-one drone of a world that runs unpaced in zsim's own environment.
+the only drone of a world that runs unpaced in zsim's own environment.
 """
 
 import subprocess
@@ -18,7 +18,7 @@ from benchmarks.exchange.lap import free_port
 from benchmarks.peers import FOLDER, ROOT
 from benchmarks.run import CLI
 
-REMOVED: dict[str, tuple[str, ...]] = {"plain": ("numba", "llvmlite"), "numba": ()}  # taken out of the extra `agents`
+REMOVED: dict[str, tuple[str, ...]] = {"plain": ("numba", "llvmlite"), "numba": ()}  # removed after installation
 SHORT_S, LONG_S = 5.0, 45.0  # simulated durations of two flights; their difference excludes start-up
 TIMEOUT_S = 180.0
 
@@ -55,7 +55,7 @@ def fly(python: Path, folder: Path) -> dict[str, float]:
     """Fly one drone; return its estimator's peak resident memory [MB] and CPU ms per simulated second.
 
     Raises:
-        RefusedError: the world or the estimator failed.
+        RefusedError: the estimator failed, or did not finish in time.
     """
     (short_s, _), (long_s, resident) = (_flown(python, folder, seconds) for seconds in (SHORT_S, LONG_S))
     return {"resident_mb": resident, "cpu_ms_per_simulated_s": 1e3 * (long_s - short_s) / (LONG_S - SHORT_S)}

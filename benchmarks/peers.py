@@ -55,7 +55,7 @@ def versions() -> dict[str, str]:
 
 
 def _installed(peer: str, module: str, arguments: tuple[str, ...], say: Callable[[str], None]) -> str | None:
-    """Install a peer unless it can be imported; return None, or the reason if it still cannot."""
+    """Install a peer unless it can be imported; return None, or why it still cannot be imported."""
     if _importable(module) is None:
         return None
     say(f"installing {peer} for comparison")

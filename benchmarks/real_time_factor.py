@@ -26,7 +26,7 @@ OPTIONS: dict[str, tuple[str, ...]] = {"in_process": ("--in-process",), "hosted"
 
 
 def measure(repeats: int) -> Sheet:
-    """Fly every size in every mode of LABELS, in turn."""
+    """Fly every size in every mode of LABELS, in turn; as processes, only sizes up to PROCESSES_MAX."""
     sheet = Sheet("c", "× real time")
     todo = [(name, size) for size in SIZES for name in LABELS if name != "processes" or size <= PROCESSES_MAX]
     progress = Progress("c", repeats * len(todo))

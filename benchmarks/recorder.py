@@ -1,7 +1,7 @@
 """Part i: the recorder in a federation of 50 drones: whether it records everything, and what share of a core it takes.
 
-Missing messages are found by `seq`, which counts from 0 without gaps on every key. The share is processor time divided
-by wall time from the first recorded megabyte to the end of the run, which excludes start-up.
+Missing messages are found by `seq`, which counts from 0 without gaps on every key except views. The share is processor
+time divided by wall time from the first recorded megabyte to the end of the run, which excludes start-up.
 """
 
 import subprocess
@@ -33,7 +33,7 @@ BEGUN_BYTES = 1_000_000  # record size above which the run counts as under way
 LOOK_S = 0.25  # wall time between two samples of the recorder's processor time
 TIMEOUT_S = 300.0
 FIELDS = ("core_percent", "messages_per_s", "megabytes_per_s", "missing", "broken")
-SLOWEST_S = 1.0  # s; five times the period of GPS, the slowest periodic key
+SLOWEST_S = 1.0  # s; five times the period of GPS, the slowest of the keys in question
 
 
 class _Seq(msgspec.Struct):
@@ -125,7 +125,7 @@ def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
             try:
                 seq = decoder.decode(message.payload).seq
             except REFUSALS:
-                faults[message.key] = "is no message of the contract"
+                faults[message.key] = "has a message that does not decode"
                 continue
             wanted = expected.get(message.key, 0)
             expected[message.key] = seq + 1
@@ -138,7 +138,7 @@ def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
 
 
 def _cut_short(ends_ns: Mapping[str, int], last_ns: int) -> dict[str, str]:
-    """Return the drones' periodic keys that end before the run, as faults: a loss at the end leaves no gap in `seq`."""
+    """Return as faults the drones' periodic keys that end over SLOWEST_S before the run, which `seq` does not show."""
     early = {key: (last_ns - end_ns) / 1e9 for key, end_ns in ends_ns.items() if key.startswith("drone/")}
     of_a_rate = {key: by_s for key, by_s in early.items() if "/sensor/" in key or key.endswith(("/truth", "/estimate"))}
     return {key: f"ends {by_s:g} s before the run" for key, by_s in of_a_rate.items() if by_s > SLOWEST_S}

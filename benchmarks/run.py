@@ -103,7 +103,7 @@ def _cpu_by_role(launcher: int) -> dict[str, float]:
 
 
 def role_of(process: psutil.Process) -> str:
-    """Return a run's process as `role.thing`, as in `estimator.drone1`, or `forkserver` for the parent of forked roles.
+    """Return a run's process as `role` or `role.thing` (estimator.drone1); `forkserver` for the parent of forked roles.
 
     Raises:
         psutil.NoSuchProcess: the process has ended.

@@ -1,6 +1,7 @@
 """A custom sensor: airspeed from a pitot tube along the sensor's x axis.
 
-    zsim run scenarios/step.yaml --set 'sensors.pitot={module: airspeed, mount: {position_m: [0.15, 0, 0]}}'
+    PYTHONPATH=examples zsim run scenarios/step.yaml \
+        --set 'sensors.pitot={module: airspeed, mount: {position_m: [0.15, 0, 0]}}'
 
 The error model applies to the differential pressure, and follows the data sheet of Sensirion's SDP31-500Pa.
 """
@@ -21,7 +22,7 @@ class Airspeed(Sample, frozen=True):
 
 
 class PitotConfig(Sensor, frozen=True, kw_only=True):
-    rate_hz: RateHz = 50.0  # Hz; an assumption: the SDP31 supports up to 2000
+    rate_hz: RateHz = 50.0  # Hz; an assumption: the SDP31 supports up to 2000 Hz
     pressure_pa: ErrorModel = ErrorModel(
         noise=0.1,  # Pa; zero-point repeatability of the SDP31
         bias=0.2,  # Pa; zero-point accuracy of the SDP31

@@ -1,4 +1,4 @@
-"""A custom formation law: cyclic pursuit, in which each drone heads for the next one, turned by an angle.
+"""A custom formation law: cyclic pursuit, in which each drone flies at a fixed angle to the direction of the next one.
 
 zsim run examples/laws.yaml --set agents.pilot.class=cyclic_pursuit:CyclicPursuit
 PYTHONPATH=examples zsim board --laws consensus,cyclic_pursuit:CyclicPursuit --scenarios trajectory --seeds 1
@@ -7,7 +7,8 @@ PYTHONPATH=examples zsim board --laws consensus,cyclic_pursuit:CyclicPursuit --s
 
 Marshall, Broucke, Francis, Formations of vehicles in cyclic pursuit, IEEE Trans. Automatic Control 49 (2004). With a
 turn of pi / n outwards the drones circle at a constant radius; here the circle also moves at the reference's velocity.
-The scenario must list the drones in counter-clockwise order around the centre.
+The scenario must list the drones in counter-clockwise order around the centre. A drone that does not hear the next one
+flies at v_r.
 """
 
 import math

@@ -16,8 +16,8 @@ from zsim_analysis.reading.recorded_flight import RecordedFlight
 def effort(flight: RecordedFlight) -> dict[str, float | None]:
     """Return the RMS over drones and time of the commanded velocity [m/s], and the mean NEES of the estimates.
 
-    Both cover the time from engagement onwards; None if the formation never engaged. The NEES (normalised estimation
-    error squared) of an estimator that reports its true covariance is 6 on average.
+    Both cover the time from engagement onwards, and are None if the formation never engaged. The NEES (normalised
+    estimation error squared) of an estimator that reports its true covariance is 6 on average.
     """
     engaged_s = formations_of(flight)[0].engaged_s
     if engaged_s is None:

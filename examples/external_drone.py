@@ -1,4 +1,4 @@
-"""A driver of an external drone that needs only zenoh and msgpack; the drone follows velocity commands with a lag.
+"""A driver that needs only zenoh and msgpack, for an external drone that follows velocity commands with a lag.
 
 Where this program computes the motion, a real driver would talk to an aircraft. Give the drone `body: external` in a
 scenario:

@@ -63,7 +63,7 @@ def until(subscription: Subscription, phase: str) -> flight_messages.ClusterStat
 def fly(link: Session) -> None:
     subscription = link.subscribe(keys.cluster_state(CLUSTER))
     ask(link, subscription, "takeoff")  # granted once the estimates are good enough
-    ask(link, subscription, "engage")  # granted once all drones have climbed to 1.5 m
+    ask(link, subscription, "engage")  # granted once all drones have climbed to about 1.5 m
     ask(link, subscription, "trajectory", waypoints=waypoints())
     show(subscription)
     ask(link, subscription, "land")

@@ -3,7 +3,8 @@
     zsim world scenarios/step.yaml --set 'processes.expect=[foreign.drone1]' --duration 60
     python examples/foreign_estimator.py tcp/127.0.0.1:7447
 
-Fixed gains combine GPS, barometer and flow; the heading comes from the magnetometer as if the drone were level.
+Fixed gains combine GPS, barometer and flow, except that the first GPS fixes are averaged; the heading comes from the
+magnetometer as if the drone were level.
 """
 
 import math
@@ -18,7 +19,7 @@ import zenoh
 
 ENDPOINT = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"
 ME, DRONE = "foreign.drone1", "zsim/drone/drone1"
-BEARING = math.atan2(17.8, -2.8)  # rad; bearing of the default environment.magnetic_field_ut
+BEARING = math.atan2(17.8, -2.8)  # rad; direction of the default environment.magnetic_field_ut, from east towards north
 START_S = 60.0  # wall time; the world may still be starting and compiling its kernel
 SILENCE_S = 10.0  # wall time; even while simulated time stands still, the world publishes its clock once a second
 FIX_GAIN, HEIGHT_GAIN = 0.02, 0.1

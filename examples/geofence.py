@@ -1,8 +1,8 @@
 """A custom agent: lands every drone whose estimate leaves a circle around the origin.
 
-zsim run scenarios/step.yaml --agent 'geofence:Geofence radius_m=4.0'   with a run
-zsim agent geofence:Geofence radius_m=4.0                               beside a running federation
-python examples/geofence.py scenarios/step.yaml 4.0                     from Python
+PYTHONPATH=examples zsim run scenarios/step.yaml --agent 'geofence:Geofence radius_m=4.0'   with a run
+PYTHONPATH=examples zsim agent geofence:Geofence radius_m=4.0                               beside a running federation
+python examples/geofence.py scenarios/step.yaml 4.0                                         from Python
 """
 
 import math
@@ -13,7 +13,7 @@ import zsim
 
 
 class Geofence(zsim.Agent):
-    """Sends `land` to every airborne drone whose estimated position is outside the circle."""
+    """Sends `land` to every hovering or flying drone whose estimated position is outside the circle."""
 
     name = "fence.main"  # name of the agent's process, as role.thing
     reads = ("drone/*/sensor/status", "drone/*/estimate")

@@ -29,7 +29,7 @@ VEHICLE = replace(
     thrust_n_s2=THRUST_N_S2,
     torque_nm_s2=0.016 * THRUST_N_S2,  # N m s^2; RotorS: torque per thrust is 0.016 m
     rotor_time_constant_s=0.02,  # s; RotorS: 0.0125 s up and 0.025 s down
-    rotor_min_rad_s=100.0,  # rad/s; an assumption, about a fortieth of the hover thrust
+    rotor_min_rad_s=100.0,  # rad/s; an assumption: it gives about a fortieth of the hover thrust
     rotor_max_rad_s=838.0,  # rad/s
     drag_n_s_m=0.0,  # N s/m; RotorS attributes all drag to the rotors
     aerodynamics=Aerodynamics(rotor_drag_n_s2_m=8.06428e-5),  # N s^2/m

@@ -3,7 +3,7 @@
     python examples/leader_cluster.py
     PYTHONPATH=examples zsim run scenarios/step.yaml --set clusters.main.space=leader_cluster:LeaderCluster
 
-The first command checks the Jacobian against finite differences; the second flies with it.
+The first command checks the Jacobian against finite differences; the second flies with this space.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ STEP = 1e-6  # m or rad; step of the finite differences
 
 
 class LeaderCluster(TriadCluster):
-    """c as in the paper, but (x_c, y_c, z_c) is robot 1's position, so its command does not depend on the others."""
+    """c as in the paper, but (x_c, y_c, z_c) is robot 1's position, so that the others do not affect its command."""
 
     def forward(self, p_W: Array, yaw: Array) -> Array:
         c = super().forward(p_W, yaw)
@@ -61,4 +61,4 @@ if __name__ == "__main__":
     error = jacobian_error(LeaderCluster(3), places_m, np.array([0.1, -0.2, 0.3]))
     print(f"Jacobian: off by at most {error:.1e}")
     if error > 1e-6:
-        raise SystemExit("the Jacobian does not belong to the kinematics")
+        raise SystemExit("the Jacobian does not match the kinematics")

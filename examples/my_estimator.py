@@ -1,4 +1,4 @@
-"""A custom estimator that replaces the stock one, with fixed gains instead of a Kalman filter.
+"""A custom estimator that replaces the stock one, with gains that decrease to fixed values instead of a Kalman filter.
 
     zsim run scenarios/step.yaml --set estimation.algorithm=my_estimator:MyEstimator
 
@@ -82,7 +82,7 @@ class MyEstimator:
         )
 
     def _covariance(self) -> tuple[float, ...]:
-        """Return a diagonal 6 x 6 matrix, row-major; its horizontal variance is that of filtered white GPS errors."""
+        """Return a diagonal 6 x 6 matrix, row-major; `level` is the variance of filtered white GPS errors."""
         gain = self._gps_gain()
         level, up, speed = gain / (2 - gain) * GPS_SIGMA_M**2, HEIGHT_SIGMA_M**2, SPEED_SIGMA_M_S**2
         diagonal = (level, level, up, speed, speed, speed)

@@ -1,4 +1,4 @@
-"""Read drone1's IMU, fly it by velocity commands, and take part in the lockstep, with only zenoh and msgpack."""
+"""Read drone1's IMU, fly the drone by velocity commands, and take part in the lockstep, with only zenoh and msgpack."""
 
 import os
 import queue

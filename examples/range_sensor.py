@@ -4,7 +4,8 @@
     python examples/range_sensor.py tcp/127.0.0.1:7447
 
 Publishes `drone/drone1/range/drone2` five times per simulated second. The key is not part of the contract: only
-`zsim echo` and the recorder read it, and it is not counted in `sent`, unlike commands, estimates and cluster states.
+`zsim echo` and the recorder read it, and its messages are not counted in `sent`, unlike commands, estimates and cluster
+states.
 """
 
 import math

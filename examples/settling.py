@@ -1,4 +1,4 @@
-"""Custom metrics of a sweep: the settling time and the overshoot of the formation's shape.
+"""Custom metrics of a sweep: the settling time and the overshoot of the formation's side p.
 
     PYTHONPATH=examples zsim sweep scenarios/step.yaml --vary wind.gust_m_s=0,1 --set report.metrics=settling:settling
 

@@ -6,7 +6,8 @@ python examples/swarm.py
 
 Consensus on displacements (Olfati-Saber, Fax and Murray 2007, Proc. IEEE 95(1)): each pilot flies
 u_i = k sum_j ((p_j - c_j) - (p_i - c_i)) over the drones that it hears, where c is a drone's position in the formation.
-The error decays at rate k lambda_2, lambda_2 being the graph's algebraic connectivity; the centroid does not move.
+The error decays at least at rate k lambda_2, with the graph's algebraic connectivity lambda_2; the centroid does not
+move.
 """
 
 import math

@@ -3,10 +3,10 @@
 zsim run examples/wall.yaml
 python examples/wall.py
 
-Each beam limits how fast the formation may approach what it sees: v . u <= a (r - keep), where r is the range
-along the beam's direction u. If r >= keep initially, it remains so: a control barrier function of first order (Ames,
-Xu, Grizzle and Tabuada, Control barrier function based quadratic programs for safety critical systems, IEEE Trans.
-Automatic Control 62(8), 2017).
+Each horizontal beam limits how fast the formation may approach what the beam hits: v . u <= a (r - keep), where r is
+the range along the beam's direction u. If r >= keep initially, it remains so: a control barrier function of first order
+(Ames, Xu, Grizzle and Tabuada, Control barrier function based quadratic programs for safety critical systems, IEEE
+Trans. Automatic Control 62(8), 2017).
 """
 
 from pathlib import Path
@@ -40,7 +40,7 @@ class OffTheWall(zsim.ControlLaw):
             if sample is None or self.now_ns - sample.t_sample_ns > OLD_NS:
                 continue
             for beam, range_m in zip(sample.beams, sample.ranges_m, strict=True):
-                if beam in TURNED and range_m > 0.0:  # 0 means that nothing is in range
+                if beam in TURNED and range_m > 0.0:  # 0 means that there was no echo
                     u_W = np.array([np.cos(heading + TURNED[beam]), np.sin(heading + TURNED[beam])])
                     most = self.parameters.approach_1_s * (range_m - self.parameters.keep_m)
                     c_dot[centre] -= max(float(u_W @ c_dot[centre]) - most, 0.0) * u_W

@@ -164,7 +164,7 @@ def reason_of(error: BaseException) -> str:
     return text if isinstance(error, ZsimError) and text else f"{type(error).__name__}: {text}"
 
 
-def without_figures(text: str) -> str:
+def without_numbers(text: str) -> str:
     """Return a reason with its numbers replaced by #, except in names, to compare reasons regardless of numbers."""
     return _NUMBER.sub("#", text)
 

@@ -59,7 +59,7 @@ def no_locks(folder: Path) -> str | None:
 
 
 @contextmanager
-def held_folder(folder: Path, mark: str, own: Collection[str], force: bool, use: str, others: str) -> Iterator[None]:
+def locked_folder(folder: Path, mark: str, own: Collection[str], force: bool, use: str, others: str) -> Iterator[None]:
     """Create a folder and lock it against other processes for the duration of the block.
 
     Args:

@@ -201,7 +201,7 @@ def without_map(info: Info, scenario: Scenario) -> tuple[Info, Scenario]:
 
 
 def with_own_agents(scenario: Scenario, names: Sequence[str]) -> Scenario:
-    """Return a resolved scenario changed to wait for users' agents, and to end if one of them dies.
+    """Return a resolved scenario whose run waits for users' agents, and ends if one of them dies.
 
     The scenario's entries for these agents in `processes.on_death` take precedence.
     """
@@ -266,5 +266,5 @@ def own_agent(
 
 
 def agent_class(role: str) -> Callable[..., Agent]:
-    """Return the class of a role's agents; its module is imported only now, since hosts of other roles do without."""
+    """Return the class of a role's agents; its module is imported only now, as hosts of other roles do not need it."""
     return plugin.load(AGENTS[role].agent, role, Agent)

@@ -1,7 +1,8 @@
 """The recorder as a process: writes every message on every key to `run.mcap`.
 
-The run does not wait for the recorder gate by gate, but the world is never further ahead of the record on disk than the
-world's history reaches back. A recorder that rejoins, or replaces a dead one, therefore continues without a gap.
+The run does not wait for the recorder gate by gate, but in lockstep the world is never further ahead of the record on
+disk than the world's history reaches back. A recorder that rejoins, or replaces a dead one, therefore continues without
+a gap.
 """
 
 import contextlib
@@ -34,7 +35,7 @@ TICK_S = 0.1  # interval between checks of the open chunk's age and for a reques
 JOIN_S = 1.0  # wall time after which a join is repeated if no event confirms it, since the world may have missed it
 LEAD_MAX_NS = 4_000_000_000  # maximum lead of the world over the record on disk; the world's history covers 5 s
 DRAIN_S = 1.0  # time to wait for the byes of other processes after the clock has stopped
-STOP_DRAIN_S = 0.5  # time to wait for the end of the run after a requested stop, since both may be stopped together
+STOP_DRAIN_S = 0.5  # time to wait for the end of the run after a requested stop, as the world may be stopped, too
 QUIET_S = 1.5  # time without a clock after which one was missed: even a paused world sends one per second
 
 REPLAY_S = 5.0  # timeout of queries, which a hub answers within milliseconds
@@ -115,9 +116,7 @@ class Recorder:
         try:
             if self._writer.has_former:
                 self._resume()
-                self._print(
-                    f"{NAME}: goes on with {self._writer.path} after t = {self._participant.now_ns / 1e9:.2f} s"
-                )
+                self._print(f"{NAME}: continues {self._writer.path} after t = {self._participant.now_ns / 1e9:.2f} s")
             else:  # a replay may no longer contain these last values
                 lasting = {keys.INFO: messages.encode(self._info)}
                 for key in (keys.INFO, keys.FAULTS, keys.camera_info("*", "*")):
@@ -137,7 +136,7 @@ class Recorder:
             if ticker.is_alive():
                 ticker.join()
         if self._refused_count:
-            why = f"a record holds {CHANNELS_MAX} keys, and these are on further keys"
+            why = f"a record holds at most {CHANNELS_MAX} keys, and these are on further keys"
             self._print(f"{NAME}: {self._refused_count} messages are missing from the record: {why}")
         if self._participant.superseded:
             why = self._participant.end_reason
@@ -241,7 +240,7 @@ class Recorder:
                 held.clear()
 
     def _fetch_missed(self, before: Clock | None = None) -> None:
-        """Write the messages that the world still has since the newest one on record, up to a clock if given."""
+        """Write the messages that the world still has since the newest one in the record, up to a clock if given."""
         self._writer.flush()
         self._known.add_tail(self._writer.path)
         self._catch_up(before)

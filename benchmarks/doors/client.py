@@ -19,7 +19,7 @@ import zenoh
 CONNECTIONS = 4  # number of HTTP connections, kept open
 KEY = "bench/value"
 MESSAGE = {"t_ns": 0, "seq": 0, "accel_m_s2": [0.1, 0.2, 9.81], "gyro_rad_s": [0.01, 0.02, 0.03]}
-AHEAD = 2_000  # messages under way at most; the gateway's queue for a client holds about 20 000 of these
+AHEAD = 2_000  # maximum number of messages under way; the gateway's queue for a client holds about 20 000 of these
 PACE_S = 0.002  # time between messages whose latency is measured, so that none waits for another
 
 
@@ -29,7 +29,7 @@ def quantiles(took_s: list[float]) -> dict[str, float]:
 
 
 async def rest(port: int, seconds: float, method: str) -> dict[str, float]:
-    """Send requests on several connections, then on one; return requests per second, and the latency of one."""
+    """Send requests on several connections, then on one; return the former's rate [1/s], the latter's latency [ms]."""
     url = f"http://127.0.0.1:{port}/json/{KEY}"
     body = json.dumps(MESSAGE).encode()
     took_s: list[float] = []
@@ -63,7 +63,7 @@ def trip(port: int, seconds: float) -> dict[str, float]:
 
 
 def zenoh_flow(port: int, endpoint: str, seconds: float) -> dict[str, float]:
-    """Publish and receive on Zenoh; return messages per second, and the latency of one."""
+    """Publish and receive on Zenoh; return messages per second, and their latency at a slow pace."""
     with zenoh.open(_config(endpoint)) as sender, zenoh.open(_config(endpoint)) as receiver:
         taker = Taker()
         declared = receiver.declare_subscriber(f"zsim/{KEY}", lambda sample: taker.take(sample.payload.to_bytes()))
@@ -73,7 +73,7 @@ def zenoh_flow(port: int, endpoint: str, seconds: float) -> dict[str, float]:
 
 
 def lines_flow(port: int, endpoint: str, seconds: float) -> dict[str, float]:
-    """Publish on Zenoh, and receive on the gateway's port for lines; return the same."""
+    """Publish on Zenoh, and receive on the gateway's port for lines; return the same quantities as `zenoh_flow`."""
     with zenoh.open(_config(endpoint)) as sender:
         taker, stream = Taker(), Lines(port)
         stream.ask({"op": "subscribe", "key": KEY})
@@ -102,7 +102,7 @@ class Taker:
     def until(self, count: int, timeout_s: float = 60.0) -> None:
         until_s = time.perf_counter() + timeout_s
         while len(self.came_s) < count:
-            assert time.perf_counter() < until_s, f"{len(self.came_s)} of {count} came"
+            assert time.perf_counter() < until_s, f"{len(self.came_s)} of {count} messages arrived"
             time.sleep(PACE_S)
 
 
@@ -133,7 +133,7 @@ def _latency(publisher: zenoh.Publisher, taker: Taker, seconds: float) -> dict[s
 
 
 def _rate(publisher: zenoh.Publisher, taker: Taker, seconds: float) -> float:
-    """Publish without pauses, never farther ahead of the receiver than its queue allows; return messages per second."""
+    """Publish without pauses, never more than AHEAD messages ahead of the receiver; return messages per second."""
     taker.came_s.clear()
     start_s = time.perf_counter()
     sent = 0
@@ -162,8 +162,10 @@ def _config(endpoint: str) -> zenoh.Config:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("what", choices=["get", "put", "trip", "lines", "zenoh"])
-    parser.add_argument("--port", type=int, required=True, help="of HTTP for get and put, of lines for the others")
-    parser.add_argument("--endpoint", default="", help="of the world, for lines and zenoh")
+    parser.add_argument(
+        "--port", type=int, required=True, help="port of HTTP for get and put, of lines otherwise; zenoh ignores it"
+    )
+    parser.add_argument("--endpoint", default="", help="endpoint of the world, for lines and zenoh")
     parser.add_argument("--seconds", type=float, default=2.0)
     given = parser.parse_args()
     if given.what in ("get", "put"):

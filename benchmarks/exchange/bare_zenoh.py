@@ -16,9 +16,9 @@ LOW_LATENCY = {"transport/unicast/qos/enabled": "false", "transport/unicast/lowl
 def main() -> None:
     options = parser(__doc__)
     options.add_argument("--receive", choices=("queue", "drain"), default="drain", help="how the world takes answers")
-    options.add_argument("--express", action="store_true", help="send every message at once")
+    options.add_argument("--express", action="store_true", help="send every message immediately, unbatched")
     options.add_argument(
-        "--low-latency", action="store_true", help="use the transport without priorities and fragmentation"
+        "--low-latency", action="store_true", help="use Zenoh's transport without priorities and fragmentation"
     )
     given = options.parse_args()
     if given.agent is None:
@@ -50,13 +50,13 @@ def world(count: int, seconds: float, receive: str, express: bool, low_latency: 
 
 
 def _take(handler: zenoh.handlers.Handler, count: int) -> None:
-    """Take `count` answers, sleeping before each."""
+    """Take `count` answers, each with a blocking call."""
     for _ in range(count):
         handler.recv().payload.to_bytes()
 
 
 def _drain(handler: zenoh.handlers.Handler, count: int) -> None:
-    """Take `count` answers, sleeping only when none is waiting."""
+    """Take `count` answers, blocking only when none is waiting."""
     for _ in range(count):
         (handler.try_recv() or handler.recv()).payload.to_bytes()
 

@@ -1,8 +1,8 @@
 """HELICS: a broker, the world as a federate, and every agent as a federate in its own process.
 
 The agents' time is half a step after the world's, so that a value travels from the world to an agent and back within
-one step, as with the other contenders; this takes two grants. `--one-grant` instead measures the exchange between
-neighbours (Jacobi), in which every answer arrives one step late.
+one step, as with the other contenders; this takes two grants. `--one-grant` instead measures a Jacobi exchange, in
+which world and agents step at the same times, and every answer arrives one step late.
 """
 # pyright: reportMissingImports=false
 

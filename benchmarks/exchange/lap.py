@@ -1,4 +1,4 @@
-"""The parts shared by all contenders of the exchange: clock of a run, agent processes, options, result."""
+"""The parts shared by the contenders of the exchange: clock of a run, agent processes, options, result."""
 
 import argparse
 import json
@@ -54,8 +54,8 @@ class Lap:
 def parser(text: str | None) -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(description=(text or "").splitlines()[0])
     made.add_argument("--agents", type=int, default=1, help="number of agent processes")
-    made.add_argument("--seconds", type=float, default=1.0, help="wall time counted")
-    made.add_argument("--lookahead", action="store_true", help="begin a step while answers to the last are outstanding")
+    made.add_argument("--seconds", type=float, default=1.0, help="wall time over which steps are counted")
+    made.add_argument("--lookahead", action="store_true", help="begin a step while answers to the previous are due")
     made.add_argument("--agent", type=int, help="act as this agent (passed to child processes)")
     made.add_argument("--at", help="address of the world (passed to child processes)")
     return made
@@ -63,7 +63,7 @@ def parser(text: str | None) -> argparse.ArgumentParser:
 
 @contextmanager
 def agents(module: str, count: int, *options: str) -> Iterator[Sequence[subprocess.Popen[bytes]]]:
-    """Run `count` agents of a contender, and wait until all have left."""
+    """Run `count` agents of a contender, and wait until all have left; after an error, kill them."""
     command = [sys.executable, "-m", module, "--agents", str(count), *options]
     started = [subprocess.Popen([*command, "--agent", str(number)]) for number in range(count)]
     try:

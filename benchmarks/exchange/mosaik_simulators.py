@@ -19,7 +19,7 @@ from benchmarks.exchange.lap import PAYLOAD
 
 TEXT = "x" * len(PAYLOAD)
 WARM_STEPS = 20
-STEPS_S = 1200  # steps/s with one agent on the machine of benchmarks/README.md; sets the number of steps
+STEPS_S = 1200  # assumed steps/s of all simulators together, the world's included; sets the number of steps
 META: mosaik_api_v3.types.Meta = {
     "api_version": "3.0",
     "type": "time-based",

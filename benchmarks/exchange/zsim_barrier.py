@@ -1,4 +1,4 @@
-"""zsim's own lockstep with nothing to compute: the real world, barrier, hub and runner over Zenoh.
+"""zsim's own lockstep with nothing to compute: the real world, barrier, history and runner over Zenoh.
 
 Included: WorldProcess, World, Barrier and MessageHistory, which build, encode, hash, put and keep truth, status and
 clock of every gate; in every agent, Runner, Inbox and AgentParticipant, which decode the status and encode and put the
@@ -32,7 +32,7 @@ GATE_NS = 20_000_000
 def main() -> None:
     options = parser(__doc__)
     options.add_argument(
-        "--low-latency", action="store_true", help="use the transport without priorities and fragmentation"
+        "--low-latency", action="store_true", help="use Zenoh's transport without priorities and fragmentation"
     )
     given = options.parse_args()
     with _transport(given.low_latency):
@@ -108,8 +108,8 @@ def _scenario(count: int) -> Any:
 def _transport(low_latency: bool) -> Iterator[None]:
     """With `low_latency`, let sessions use Zenoh's low-latency transport, which zsim itself does not offer.
 
-    Zenoh 1.10.2 panics when a listener for transport events is declared on this transport, so the agents declare none
-    and would not notice a lost link.
+    Zenoh 1.10.2 panics when a listener for transport events is declared on this transport, so the sessions declare
+    none, and the agents would not notice a lost link.
     """
     common = zenoh_settings.common
 

@@ -12,14 +12,16 @@ from typing import Any
 from benchmarks.kernel.stopwatch import Flight, serve, single
 
 RATE_HZ = 400
-TOGETHER_MAX = 100  # drones in one world; a thousand take two minutes to build in one, and run as fast in a world each
+TOGETHER_MAX = (
+    100  # maximum number of drones in one world; 1000 take two minutes to build, and run as fast in 1000 worlds
+)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rk4", action="store_true")
-    parser.add_argument("--long", action="store_true", help="a second per call")
-    parser.add_argument("--threads", action="store_true", help="on all cores")
+    parser.add_argument("--long", action="store_true", help="simulate a second per call")
+    parser.add_argument("--threads", action="store_true", help="use all cores")
     given = parser.parse_args()
     os.environ["JAX_PLATFORMS"] = "cpu"
     if not given.threads:

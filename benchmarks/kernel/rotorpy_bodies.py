@@ -24,7 +24,7 @@ HOVER_RAD_S = math.sqrt(quad_params["mass"] * 9.81 / (4 * quad_params["k_eta"]))
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--batch", action="store_true")
-    parser.add_argument("--threads", action="store_true", help="on all cores")
+    parser.add_argument("--threads", action="store_true", help="use all cores")
     given = parser.parse_args()
     if not given.threads:
         single()

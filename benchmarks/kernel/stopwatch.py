@@ -1,4 +1,4 @@
-"""Shared by all contenders of part b: timing a step in CPU time of all threads, and serving measurements."""
+"""Shared by the contenders of parts b and f: timing a step in CPU time of all threads, and serving measurements."""
 
 import json
 import os

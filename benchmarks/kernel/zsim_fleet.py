@@ -1,4 +1,4 @@
-"""zsim's fleet with firmware, all sensors with noise, wind and encounters; or its compiled kernel alone (`--bare`).
+"""zsim's fleet with firmware, all sensors, noise, wind, downwash and contacts; or its compiled kernel alone (`--bare`).
 
 Physics every 2.5 ms by fourth-order Runge-Kutta, firmware and IMU every 5 ms, one call per gate of 20 ms. The fleet
 draws its noise and returns samples and truth as arrays; the bare kernel reuses the same noise and returns nothing.

@@ -58,7 +58,7 @@ def _put(drone: int, client: int, p_W: np.ndarray, yaw: float, mass_kg: float) -
 
 
 def _follow(way: Way, drones: list[int], client: int, steps: int) -> tuple[float, float]:
-    """Fly for `steps`; return the sum of squared distances from the paths and the drones' closest approach."""
+    """Fly `steps` control steps; return the sum of squared distances from the paths and the closest approach."""
     controls = [Control(way.yaw[0, k]) for k in range(3)]
     squares, closest, p_W = 0.0, math.inf, np.zeros((3, 3))
     for step in range(steps):

@@ -1,4 +1,4 @@
-"""Shared by all peers that fly the paths of Test 1: a process with its own core that serves flights.
+"""Shared by all programs that fly the paths of Test 1: a process with its own core that serves flights.
 
 The process answers each line {"seed": n} of stdin on stdout until stdin ends; the first answer includes compilation.
 """

@@ -1,4 +1,4 @@
-"""`zsim rerun`: flies a recorded run again from its own inputs and compares the truth with that on record.
+"""`zsim rerun`: flies a recorded run again from its own inputs and compares the truth with that in the record.
 
 First, world and agents are run again, with the inputs of others (operators, users' programs) from the record. If the
 truth differs, or the agents cannot be run again, the world is run alone, with all commands from the record: if that
@@ -44,7 +44,7 @@ COMPARED_FIELDS = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_ve
 class RerunResult(NamedTuple):
     """The result of flying a run again."""
 
-    compared: "TruthComparison"  # comparison with the truth on record
+    compared: "TruthComparison"  # comparison with the recorded truth
     sha256: str  # hash of the truth
     until: str  # why the comparison ended before the record did; empty if it did not
     refused: list[str]  # requests that were carried out in the recorded run but are refused now
@@ -69,7 +69,7 @@ def rerun_record(
         if record.info.replay_of:
             raise RunError(f"{run_path}: is the record of a replay; rerun that of run {record.info.replay_of}")
         if not plugin.may_import() and (names := record.scenario.own_code()):
-            reason = f"its scenario names {listed(names)}: code that a rerun runs, and only with --trust"
+            reason = f"its scenario names {listed(names)}: code that is run only with --trust"
             raise RunError(f"{run_path}: {reason}")
         if external := record.scenario.external():
             reason = f"has drones whose bodies are external ({listed(external)}); they cannot be flown again"
@@ -79,9 +79,9 @@ def rerun_record(
         own_fingerprint, recorded_by = fingerprint(), record.info.version
         if other_fingerprints := {record.info.fingerprint, *agents.fingerprints} - {own_fingerprint}:
             fingerprints_text = f"{', '.join(sorted(other_fingerprints))}; here {own_fingerprint}"
-            note(f"recorded with other code (fingerprint {fingerprints_text}): the same bits are not promised")
+            note(f"recorded with other code (fingerprint {fingerprints_text}): the same bits are not guaranteed")
         if recorded_by != __version__:
-            note(f"recorded by zsim {recorded_by}, flown again by {__version__}: the same bits are not promised")
+            note(f"recorded by zsim {recorded_by}, flown again by {__version__}: the same bits are not guaranteed")
         if commands_only or agents.why_not:
             reason_text = "as requested" if commands_only else agents.why_not
             say(f"agents are not run again: {reason_text}; the world alone, with all recorded commands")
@@ -90,10 +90,10 @@ def rerun_record(
         result = _fly(record, agents)
         fault = _judge(record.reader, agents.truth_sha256, result, say)
         if not fault and result.failure != agents.failure:
-            say(f"on record {agents.failure or 'no class of a user failed'}")
+            say(f"in the record, {agents.failure or 'no class of a user failed'}")
             fault = f"flown again, {result.failure or 'it does not fail'}"
         elif not fault and result.failure:
-            say(f"ended as on record: {result.failure}")
+            say(f"ended as in the record: {result.failure}")
         if outputs is not None and not fault:
             fault = _compare_outputs(outputs, result, say)
         if result.compared.first is None:
@@ -153,7 +153,7 @@ def _judge(reader: RecordReader, recorded: str | None, result: RerunResult, say:
     """Report how the truth compares; return how it differs, empty if it is the same in all of an intact record."""
     compared, until = result.compared, result.until
     for refusal in result.refused:
-        say(f"was carried out on record, but is refused now: {refusal}")
+        say(f"was carried out in the recorded run, but is refused now: {refusal}")
     if compared.first is not None:
         say(f"truth differs: first {compared.first}")
         say(f"               last  {compared.last}; {compared.instants} instants compared")
@@ -166,7 +166,7 @@ def _judge(reader: RecordReader, recorded: str | None, result: RerunResult, say:
     condition = "is damaged" if reader.damaged else "does not hold the whole run" if reader.complete else "was cut"
     missing_hash = f"{recorded} cannot be verified" if recorded else "has no truth_sha256"
     reason = f"{until}, as it {condition}" if until else f"the record {condition} and {missing_hash}"
-    say(f"{reason}; truth is the same at all {compared.instants} instants before, to the bit")
+    say(f"{reason}; truth is bit-identical at all {compared.instants} instants before")
     return "" if recorded is None and not until and not reader.damaged else reason
 
 
@@ -222,7 +222,7 @@ def differing_field(recorded: Any, repeated: Any, fields: Sequence[str]) -> str:
         if isinstance(a, tuple) and isinstance(b, tuple) and len(a) == len(b):
             index = next(i for i, (one, other) in enumerate(zip(a, b, strict=True)) if one != other)
             name, a, b = f"{name}[{index}]", a[index], b[index]
-        return f"{name} is {show(a)} on record, {show(b)} flown again"
+        return f"{name} is {show(a)} in the record, {show(b)} when flown again"
     return ""
 
 
@@ -247,7 +247,7 @@ class TruthComparison:
 
 
 class OutputComparison:
-    """Compares the outputs of agents with those on record; either may come first, by up to `match_within_ns`."""
+    """Compares the outputs of agents with the recorded ones; either may come first, by up to `match_within_ns`."""
 
     def __init__(self, match_within_ns: int) -> None:
         self._match_within_ns = match_within_ns
@@ -348,8 +348,8 @@ class RerunBus(Bus):
         """Receive the inputs of a gate, let the agents answer, and advance to that gate.
 
         Raises:
-            RunError: an agent does not answer, since what it waits for is not on record; or the run ends differently.
-            RunFailedError: a user's code fails at this gate, where it did not fail on record.
+            RunError: an agent does not answer, as what it waits for is not in the record; or the run ends differently.
+            RunFailedError: a user's code fails at this gate, where it did not fail in the record.
         """
         self._admitted = _admitted(gate.inputs) if gate.t_ns else None
         for recorded in gate.inputs:
@@ -361,7 +361,7 @@ class RerunBus(Bus):
         if waiting and self._world.clock.state != "waiting":
             at = f"before {gate.t_ns / 1e9:.2f} s"
             raise RunError(
-                f"{', '.join(waiting)} cannot answer {at}: what it waits for is not on record; --commands-only"
+                f"{', '.join(waiting)} cannot answer {at}: what it waits for is not in the record; use --commands-only"
             )
         self.outputs.expire(gate.t_ns)
         self._world.advance(0)
@@ -418,7 +418,7 @@ class RerunBus(Bus):
         self._world.count_output(source)
 
     def _feed_event(self, event: run_messages.Event) -> None:
-        """Repeat what reached the world other than as a message: deaths, requests, and withheld joins."""
+        """Repeat what reached the world not as a message: deaths, overdue processes, requests, and withheld joins."""
         if event.kind in ADMISSIONS and event.source not in self._rerun:
             join_identity = _joined(event)
             if (join := self._withheld.pop(join_identity, None)) is not None:

@@ -62,7 +62,7 @@ class Moment(NamedTuple):
 
     Attributes:
         t_s: simulated time [s].
-        states: the newest received states of the clusters by name, which are two gates old.
+        states: the newest received states of the clusters by name; in lockstep, usually two gates old.
         truth: the true motion of the drones by name, except that of external ones.
         events: events since the last `wait_until`.
     """

@@ -237,7 +237,7 @@ class _StopRequest:
 
 @contextmanager
 def _ctrl_c() -> Iterator[_StopRequest]:
-    """Let Ctrl-C end a flight at its next gate, with a complete record; a second one interrupts at once."""
+    """Let Ctrl-C (in the main thread) end a flight at its next gate, its record complete; a second one acts at once."""
     request = _StopRequest()
     previous = signal.getsignal(signal.SIGINT)
     if previous is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():

@@ -166,7 +166,7 @@ class Run:
 
     @property
     def events(self) -> "DataFrame":
-        """The events, with kind, source, subject, text, and data as JSON text."""
+        """The events, with kind, source, subject, text, and data as JSON text; raises RunError if there are none."""
         return self._plain(keys.EVENT)
 
     # Errors
@@ -325,8 +325,8 @@ class Run:
         """Draw a figure of the report.
 
         Args:
-            name: errors, position, orientation, shape, plan_view, distances, drones, estimates or velocities; for
-                clusters after the first, with the cluster's name: `shape_side`.
+            name: errors, position, orientation, shape, plan_view, distances, references, radio, drones, estimates
+                or velocities; for clusters after the first, with the cluster's name: `shape_side`.
 
         Raises:
             RunError: the record has no such figure.

@@ -125,7 +125,7 @@ class Simulation:
         self.reset()
 
     def reset(self, seed: int | None = None, set: Mapping[str, Any] | None = None) -> Truth:
-        """Start a new flight; return its initial state.
+        """Start a new flight; return its initial state; raise RunError if the flight is recorded.
 
         Agents given as objects get back the attributes that they had initially.
 

@@ -105,7 +105,7 @@ def endpoint_origin(text: str, arguments: Sequence[str], environment: Mapping[st
 
 
 class RowOrder(StrEnum):
-    """Sort keys of `zsim ps`; numbers are sorted in descending order."""
+    """Sort keys of `zsim ps` and `zsim up`; numbers are sorted in descending order."""
 
     ROLE = "role"
     HOST = "host"
@@ -119,8 +119,8 @@ class RowOrder(StrEnum):
 
 ScenarioPath = Annotated[Path, Argument(help="Scenario file (YAML).", show_default=False)]
 Set = Annotated[list[str] | None, Option("--set", help="Override a field: a.b.c=value. Repeatable.")]
-Seed = Annotated[int | None, Option(help="Seed instead of the scenario's.")]
-Duration = Annotated[float | None, Option(help="Simulated seconds instead of the scenario's.")]
+Seed = Annotated[int | None, Option(help="Seed, instead of the scenario's.")]
+Duration = Annotated[float | None, Option(help="Duration in simulated seconds, instead of the scenario's.")]
 Realtime = Annotated[bool, Option(REALTIME, help="Pace by the wall clock, without waiting for any process.")]
 Rate = Annotated[
     float | None, Option(help="Simulated seconds per wall second (default: realtime 1, lockstep unpaced).")
@@ -130,7 +130,7 @@ Federation = Annotated[str, Option(envvar="ZSIM_FEDERATION", help="Name of the f
 Wait = Annotated[float | None, Option(callback=not_negative, help="Seconds to wait for a world (default: no limit).")]
 Launched = Annotated[str | None, Option("--launched", hidden=True)]  # id of the run whose launcher started the process
 Tls = Annotated[Path | None, Option("--tls", help="Folder of this process's certificate (zsim certs init).")]
-Access = Annotated[Path | None, Option("--access", help="File with Zenoh's access control (zsim certs init).")]
+Access = Annotated[Path | None, Option("--access", help="File with Zenoh's access-control rules (zsim certs init).")]
 Host = Annotated[str | None, Option("--host", help="Name of this host, as shown to others.")]
 Insecure = Annotated[bool, Option("--insecure", help="Run without TLS, on a private network.")]
 Keys = Annotated[

@@ -83,7 +83,7 @@ def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
     """Return the authority in a folder, created if the folder has none.
 
     `force`: create a new one, which invalidates all earlier certificates. Raise RunError if the authority is
-    incomplete, has expired, or cannot be read or written.
+    incomplete, its key and certificate do not match, it has expired, or it cannot be read or written.
     """
     certificate_path, key_path = folder / AUTHORITY, folder / AUTHORITY_KEY
     existing = [path for path in (certificate_path, key_path) if path.exists()]
@@ -210,7 +210,7 @@ def operators(folder: Path, hosts: Iterable[str]) -> Iterator[str]:
 
 
 def renewal_reason(folder: Path, signer: Root, request: CertificateRequest, now: datetime) -> str | None:
-    """Return why a certificate must be made; None if a valid one and its key exist."""
+    """Return why a certificate must be made; None if a valid one for these addresses and its key exist."""
     process_folder = folder / request.host / request.process
     if not all((process_folder / name).exists() for name in CERTIFICATES):
         return "new"
@@ -316,7 +316,7 @@ def exposed_keys(inventory_file: InventoryFile) -> str | None:
             exposed += [path] if path.stat().st_mode & READABLE_BY_OTHERS else []
     if not exposed:
         return None
-    further = f" and {len(exposed) - 1} more private keys" if len(exposed) > 1 else ""
+    further = f" and {len(exposed) - 1} more of the private keys" if len(exposed) > 1 else ""
     return (
         f"{min(exposed)}{further} can be read by other users of this machine; chmod -R go= {shlex.quote(str(folder))}"
     )
@@ -327,7 +327,7 @@ def enrolment(
 ) -> tuple[list[CertificateRequest], list[tuple[str, str, dict[str, Any]]]]:
     """Return the required certificates, and the (host, process, access control) of every listening process.
 
-    A role gets a certificate for every host, so that it can be moved there during a run.
+    Every process of the scenario but the world gets a certificate for every host, so that it can be moved there.
 
     Args:
         operators: people and programs that observe and command, each as NAME or NAME@HOST; at a host they connect as
@@ -403,7 +403,7 @@ _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("ingress", ("liveliness_query", "declare_liveliness_subscriber"), "watches"),
     ("egress", ("liveliness_token",), "watches"),
 )
-# Declarations are allowed to all, because nothing is sent without them; they have no payload.
+# Declarations may go to every named process, because it sends nothing without them; they have no payload.
 _DECLARATIONS = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
 _MESSAGES = (*_DECLARATIONS, "put", "delete", "query", "reply", "liveliness_token")
 ANYONE = "anyone"  # any peer with a certificate of the authority: a subject without conditions matches all
@@ -416,7 +416,7 @@ def access_control(
 ) -> dict[str, Any]:
     """Return the `access_control` section of Zenoh's configuration for a listening process.
 
-    Everything else is denied; a process that is not named may only query its own rights.
+    Everything beyond the rights of these processes is denied; any other process may only query its own rights.
 
     Args:
         clients: names of the processes that connect to the listening process.

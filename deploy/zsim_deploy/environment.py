@@ -1,6 +1,6 @@
 """`zsim rerun --install`: a Python environment with the packages of a bundle, in which the bundle is flown again.
 
-CACHE/environments/KEY    one for each Python, lock and version of zsim; KEY is a hash of these
+CACHE/environments/KEY    one for each combination of Python, zsim and packages; KEY is a hash of these
 
 zsim itself is the version on this machine; a bundle does not contain it.
 """
@@ -50,12 +50,12 @@ def rerun_in_environment(
     environment = _environment(executable, lock, needs, note)
     options = [*(["--commands-only"] if commands_only else []), *(["--trust"] if trust else [])]
     command = [str(_python_of(environment)), SAFE_PATH, "-m", "zsim_deploy", "rerun", str(bundle.resolve()), *options]
-    note(f"flying it again in {environment}")
+    note(f"flying the bundle again in {environment}")
     return subprocess.run(command, env=_clean(), check=False).returncode
 
 
 def _environment(python: str, lock: Sequence[str], needs: Sequence[str], note: Callable[[str], None]) -> Path:
-    """Return the folder of an environment with the packages of a lock file; create it if missing."""
+    """Return the folder of an environment with zsim and a bundle's packages; create it if missing."""
     version = _output([python, "-c", "import sys; print(sys.version)"], f"{python}: is not a Python interpreter")
     name, origin = str(checkout() or ""), ""
     if not name:
@@ -64,7 +64,7 @@ def _environment(python: str, lock: Sequence[str], needs: Sequence[str], note: C
     requirements = [f"{name}[{','.join(EXTRAS)}]{origin}", *needs]
     key = hashlib.sha256(json.dumps([python, version, __version__, requirements, list(lock)]).encode()).hexdigest()
     folder = default_cache() / "environments" / key[:KEY_DIGITS]
-    with file_fault(folder, "cannot be created", "set XDG_CACHE_HOME to a folder that can be written"):
+    with file_fault(folder, "cannot be created", "set XDG_CACHE_HOME to a writable folder"):
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "lock").open("a") as lock_file:
             if not take_lock(lock_file):
@@ -91,7 +91,7 @@ def _clean() -> dict[str, str]:
 
 
 def _output(command: Sequence[str], fault: str) -> str:
-    """Run a program and return its output; raise RunError with its last error line if it fails."""
+    """Return a program's output; if it fails, raise RunError with its first `ERROR:` line, else its last error line."""
     try:
         done = subprocess.run(command, env=_clean(), capture_output=True, text=True, errors="replace", check=False)
     except OSError as error:

@@ -355,7 +355,7 @@ def processes(inventory_file: InventoryFile, scenario: Scenario, pace: Sequence[
 
 
 def own_programs(inventory_file: InventoryFile, scenario: Scenario, host: str | None = None) -> list[str]:
-    """Return a line about each of the user's own programs, with its command.
+    """Return a line about each of the user's own programs, with its command if the scenario gives one.
 
     `host`: only programs placed on that host; None: all, including those without a host.
     """

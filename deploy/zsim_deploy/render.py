@@ -1,8 +1,8 @@
 """`zsim render`: the processes of a run, from inventory and scenario, as systemd, Compose or Kubernetes files.
 
 The templates in templates/ have `$name` in place of values. YAML templates are filled in as data and dumped again, so
-that every value is quoted correctly. Restart limits and exit codes are those of the supervisor, so that a role is
-restarted in the same cases as under `zsim run`.
+that every value is quoted correctly. Restart limits and exit codes are those of the supervisor, so that a role other
+than the world is restarted in the same cases as under `zsim run`.
 
 Zenoh's endpoints and the certificates name the hosts of the inventory, so containers and Pods use their host's network.
 """
@@ -61,7 +61,7 @@ def systemd(inventory_file: InventoryFile, scenario: Scenario, pace: Sequence[st
 
     The options are those of systemd.exec(5) and systemd.service(5), without MemoryDenyWriteExecute (numba compiles) and
     ProcSubset (libraries read /proc/cpuinfo). `pace`: command-line options that set the world's pace. Raises
-    InventoryError if a process has no host, or if a host has no user, or a relative path to its interpreter.
+    InventoryError if a process has no host, or if the user, folder or interpreter of a host cannot be used.
     """
     planned, hosts = inv.processes(inventory_file, scenario, pace), inventory_file.inventory.hosts
     _refuse(

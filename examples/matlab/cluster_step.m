@@ -341,7 +341,7 @@ end
 
 function state = landing(state, estimates, params)
     state = send(state, is_airborne(estimates.modes) | estimates.modes == 2, 2, params);
-    % A take-off command sent just before may still arrive, so the phase is idle only after a while on the ground.
+    % A take-off command may still be in transit, so the phase is idle only some time after the landing request.
     if all(is_down(estimates.modes)) && state.t_s - state.landing_s >= params.resend_s
         state.phase = 0;
     end

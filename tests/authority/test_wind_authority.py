@@ -32,7 +32,7 @@ def blown(row, common, own, start):
         shared = (common[k, 0], common[k, 1], common[k, 2])
         for i in range(own.shape[1]):
             mine = (own[k, i, 0], own[k, i, 1], own[k, i, 2])
-            contacts.blow(row, (0.0, 0.0, 0.0), gust[i], shared, mine, DT)
+            contacts.advance_gust(row, (0.0, 0.0, 0.0), gust[i], shared, mine, DT)
         out[k] = gust
     return out
 
@@ -116,7 +116,7 @@ def test_a_fleet_runs_the_same_gust_filter_every_5_ms():
     common, own = noise.table[2, at:].reshape(-1, 3)[:40], noise.table[:2, at:].reshape(2, -1, 3)[:, :40]
     for k in range(40):
         for i in range(2):
-            contacts.blow(row, (0.0, 0.0, 0.0), gust[i], tuple(common[k]), tuple(own[i, k]), 0.005)
+            contacts.advance_gust(row, (0.0, 0.0, 0.0), gust[i], tuple(common[k]), tuple(own[i, k]), 0.005)
     np.testing.assert_allclose(fleet.wind_m_s, gust, atol=1e-7)  # the standing drones sway by micrometres
 
 

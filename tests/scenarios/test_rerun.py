@@ -251,7 +251,7 @@ def test_a_damaged_record_is_reported_as_damaged(federation: Federation) -> None
     Expected: no line calls the record cut; the truth is the same as far as it can be compared, but the rerun fails.
     """
     federation.run(PAIR, "--in-process", "--duration", "2").ends(with_code=0)
-    alike = r"; truth is the same at all (\d+) instants before, to the bit"
+    alike = r"; truth is bit-identical at all (\d+) instants before"
     for name, part, cut, text in (
         ("last", 1.0, 0, "the record is damaged and has no truth_sha256"),
         ("last and cut", 1.0, 9, "the record is damaged and has no truth_sha256"),

@@ -225,7 +225,7 @@ def test_a_rerun_fails_at_the_same_gate_with_the_same_line(folder: Path, name: s
     assert rerun_record(folder, False, said.append, said.append) == ""
     assert said[0].startswith("run again: world, ")
     assert said[-2].startswith("truth_sha256 is the same: ")
-    assert said[-1] == f"ended as on record: {raised.value}"
+    assert said[-1] == f"ended as in the record: {raised.value}"
 
 
 @pytest.mark.parametrize(

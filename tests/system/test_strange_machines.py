@@ -82,7 +82,7 @@ def test_a_full_standard_output_is_reported_on_standard_error() -> None:
     done = subprocess.run(
         f"{shlex.join(ZSIM)} --help >/dev/full", shell=True, capture_output=True, text=True, check=True
     )
-    assert done.stderr == f"standard output cannot be written ({os.strerror(errno.ENOSPC)}); further output is lost\n"
+    assert done.stderr == f"cannot write to standard output ({os.strerror(errno.ENOSPC)}); output is lost\n"
 
 
 ODD = os.fsdecode(b"lab:3 'a' \"b\" $HOME `x` [red]%s;&| \xc3\xbc\xe9\xa3\x9b \xff")  # the last byte is not valid UTF-8

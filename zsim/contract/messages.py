@@ -229,7 +229,7 @@ class Info(Message, frozen=True):
     def __post_init__(self) -> None:
         register_sensors(self.own_sensors)
         for each in filter(MessageInfo.is_sound, self.own_messages):
-            if not each.declares(_OWN.get(each.key)):
+            if not each.declares(_USER_TYPES.get(each.key)):
                 _register(each.key, type_of_info(each))
 
     @property
@@ -263,7 +263,7 @@ RELAYED = (
 )
 """Messages, or their bases, that agents publish for each other; the world counts them like commands."""
 KEYS_KEPT = 65_536  # maximum number of keys with cached types; 1000 drones have 15 000; garbage keys are evicted
-_OWN: dict[str, type[Struct]] = {}  # users' message classes by shape of their key, from the newest Info
+_USER_TYPES: dict[str, type[Struct]] = {}  # users' message classes by shape of their key, from the newest Info
 
 
 def _plain(value: Any) -> Any:
@@ -289,7 +289,7 @@ def shape_of(key: str) -> str:
 def type_of(key: str) -> type[Struct] | None:
     """Return the message type of a key; None for an unknown key."""
     shape = shape_of(key)
-    return TOPICS[shape].message if shape in TOPICS else _OWN.get(shape)
+    return TOPICS[shape].message if shape in TOPICS else _USER_TYPES.get(shape)
 
 
 def register_sensors(sensors: Iterable[SensorInfo]) -> None:
@@ -312,8 +312,8 @@ def register_messages(kinds: Iterable[type[AgentMessage]]) -> None:
 
 
 def _register(shape: str, kind: type[Struct]) -> None:
-    if _OWN.get(shape) is not kind:
-        _OWN[shape] = kind
+    if _USER_TYPES.get(shape) is not kind:
+        _USER_TYPES[shape] = kind
         for by_key in (type_of, is_output, encoding, _reader_of):
             by_key.cache_clear()
 

@@ -34,7 +34,7 @@ def uniform(*what: object) -> float:
 
 
 _ROOT_2_PI = math.sqrt(2.0 * math.pi)
-_FARTHEST = 38.0  # standard deviations; beyond this, the density is below the smallest double
+_SIGMAS_MAX = 38.0  # standard deviations; beyond this, the density is below the smallest double
 
 
 @deferred(makes_arrays=False)
@@ -44,7 +44,7 @@ def normal_probability(x: float) -> float:
     It is 1/2 + density times (x + x^3/3 + x^5/(3 5) + ...), a series whose terms all have the same sign (G. Marsaglia,
     Evaluating the normal distribution, J. Statistical Software 11 (2004) 4).
     """
-    if not abs(x) < _FARTHEST:
+    if not abs(x) < _SIGMAS_MAX:
         return math.nan if math.isnan(x) else 1.0 if x > 0.0 else 0.0
     term, total, odd = x, x, 1.0
     while abs(term) > 1e-17 * abs(total):
@@ -58,7 +58,7 @@ def normal_quantile(probability: float) -> float:
     """Return the value below which a standard normal variable lies with a probability in [0, 1]."""
     if not 0.0 < probability < 1.0:
         return -math.inf if probability == 0.0 else math.inf if probability == 1.0 else math.nan
-    return _bisected(normal_probability, probability, -_FARTHEST, _FARTHEST)
+    return _bisected(normal_probability, probability, -_SIGMAS_MAX, _SIGMAS_MAX)
 
 
 def chi_square_probability(x: float, dof: int) -> float:

@@ -114,12 +114,12 @@ _WIDTH[[0xCC, 0xCD, 0xCE, 0xCF]] = 1, 2, 4, 8
 _T_NS, _SEQ = (np.frombuffer(msgspec.msgpack.encode(name), np.uint8) for name in ("t_ns", "seq"))
 _MAP_16 = 0xDE  # first byte of a map of more than 15 fields
 SECOND_NS = 1_000_000_000
-_LOOKED_AT = 1 << 5  # bytes of padding; the first two fields of a message always end within this length
+_PADDING_BYTES = 1 << 5  # bytes of padding; the first two fields of a message always end within this length
 
 
 def sequence_numbers(spans: MessageSpans) -> NDArray[np.int64]:
     """Return `seq` of each message, (M,); UNREAD for messages that do not begin with `t_ns` and `seq`."""
-    data = np.frombuffer(spans.content + bytes(_LOOKED_AT), np.uint8)
+    data = np.frombuffer(spans.content + bytes(_PADDING_BYTES), np.uint8)
     start = spans.start
     first = start + np.where(data[start] == _MAP_16, 3, 1)
     width = _WIDTH[data[first + len(_T_NS)]]

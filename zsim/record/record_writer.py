@@ -69,7 +69,7 @@ class RecordWriter:
             self._append(layout.opening())
             return
         try:
-            self._take_up()
+            self._continue_file()
         except OSError as error:
             self._file.close()
             raise RecordError(f"{path}: cannot be continued ({error.strerror})") from error
@@ -77,7 +77,7 @@ class RecordWriter:
             self._file.close()
             raise
 
-    def _take_up(self) -> None:
+    def _continue_file(self) -> None:
         """Read the channels and schemas of the complete part of the file."""
         _truncate_file(self._file, self.path)
         counts: Counter[int] = Counter()

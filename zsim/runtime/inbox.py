@@ -167,7 +167,7 @@ class Inbox:
             if self._waits_for(key, t_ns):
                 return key
         for key, meter in self._meters.items():
-            if meter.counts and meter.short(t_ns) and t_ns >= self._expected_from_ns.get(key, ALWAYS_NS):
+            if meter.counts and meter.is_short(t_ns) and t_ns >= self._expected_from_ns.get(key, ALWAYS_NS):
                 return key
         return None
 
@@ -256,7 +256,7 @@ class _Meter:
 
     def __init__(self) -> None:
         self.arrivals: list[int] = []  # stamps of the drone's pending sensor messages, sorted
-        # stamps and counts of the drone's pending statuses; if empty, `short` is false
+        # stamps and counts of the drone's pending statuses; if empty, `is_short` is false
         self.counts: list[tuple[int, int]] = []
         self.partial = True  # whether the first status may count messages from before the join
 
@@ -265,7 +265,7 @@ class _Meter:
         if status.seq == 0:
             self.partial = False
 
-    def short(self, t_ns: int) -> bool:
+    def is_short(self, t_ns: int) -> bool:
         """Whether sensor messages of the gates up to t_ns are missing."""
         if self.partial:
             return False

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from zsim.contract.flight_messages import ClusterState
 from zsim.contract.run_messages import Waiting, waiting_text
-from zsim.errors import printable, without_figures
+from zsim.errors import printable, without_numbers
 
 PERIOD_S = 0.2  # wall time between two updates
 SLOW_S = 3.0  # wall time until the notice; compiled code loads within 2 s unless the machine is busy
@@ -76,7 +76,7 @@ class HoldReasons:
 
     def line(self, cluster: str, state: ClusterState) -> str | None:
         """Return a line once a state's reason, whatever its numbers, has persisted for REASON_NS; otherwise None."""
-        shape = without_figures(state.reason)
+        shape = without_numbers(state.reason)
         former, since_ns = self._since.get(cluster, ("", 0))
         if shape != former:
             self._since[cluster] = (shape, state.t_ns)

@@ -57,7 +57,7 @@ AIR_M_S = 2.0
 INERTIA_MAX_MR2 = 10.0
 K1_MIN = -4 / 27  # minimum of k1 tan^2(diagonal / 2); below it r + k1 r^3 peaks within the picture
 RESERVED_ROLES = (OPERATOR, "agent", "python", "test")  # roles of zsim's own processes in addition to ROLES
-SIGHTED_MAX = 12  # maximum drones of a cluster with sightings: each estimator holds all states, at quadratic cost
+SIGHTING_DRONES_MAX = 12  # in a cluster with sightings: each estimator holds all states, at quadratic cost
 
 
 def cross_faults(
@@ -642,9 +642,9 @@ def _sighting_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Ite
         yield path, "is true and no drone has a camera; give one sensors.front_camera, and sightings or a detector"
     for index, cluster in clusters:
         count = len(cluster.drones or ())
-        if count > SIGHTED_MAX:
+        if count > SIGHTING_DRONES_MAX:
             where = f"clusters[{index}].drones"
-            yield where, f"has {count}; must have at most {SIGHTED_MAX} where {path} is true"
+            yield where, f"has {count}; must have at most {SIGHTING_DRONES_MAX} where {path} is true"
 
 
 def _camera_faults(sensors: Any) -> Iterator[Fault]:

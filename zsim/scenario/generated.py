@@ -226,7 +226,7 @@ def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
         if len(wrong := np.argwhere(~np.isfinite(heights))):
             row, column = wrong[0] + 1
             _refuse(path, where, f"has a height that is not finite in row {row}, column {column}", "must be finite")
-        triangles = _of_heights(np.asarray(heights, dtype=float), float(cell_m or 1.0))
+        triangles = _height_triangles(np.asarray(heights, dtype=float), float(cell_m or 1.0))
     elif kind in (".stl", ".obj", ".ply"):
         mesh = _read(path, where, lambda p: importlib.import_module("trimesh").load_mesh(p, process=False))
         triangles = np.asarray(getattr(mesh, "triangles", np.empty((0, 3, 3))), dtype=float).reshape(-1, TRIANGLE)
@@ -289,7 +289,7 @@ def _refuse(path: Path, where: str, fault: str, allowed: str) -> NoReturn:
     raise DocumentError([f"{where} is {show(str(path))}, which {fault}{'; ' if allowed else ''}{allowed}"])
 
 
-def _of_heights(heights: Array, cell_m: float) -> Array:
+def _height_triangles(heights: Array, cell_m: float) -> Array:
     """Return the triangles of a grid of heights, two for each cell, (T, 9)."""
     rows, columns = heights.shape
     x = (np.arange(columns) - 0.5 * (columns - 1)) * cell_m

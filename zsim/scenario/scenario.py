@@ -638,7 +638,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
 
 
 _SECTIONS = ("limits", "aerodynamics")
-_OWN = (
+_OWN_FIELDS = (
     "name",
     "body",
     "position_m",
@@ -646,7 +646,7 @@ _OWN = (
     "reference",
     "sensors",
 )  # fields of a drone that its vehicle does not define
-_SHARED = {name: kind for name, kind in get_type_hints(Drone, include_extras=True).items() if name not in _OWN}
+_SHARED = {name: kind for name, kind in get_type_hints(Drone, include_extras=True).items() if name not in _OWN_FIELDS}
 SharedVehicle: Any = defstruct(
     "SharedVehicle",
     [(name, kind | UnsetType, UNSET) for name, kind in _SHARED.items()],

@@ -154,7 +154,7 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
     flaws = chain(misread, faults(document, Document), unknown, unsound, between)
     if shortened:
         flaws = ((re.sub(r"^topology\.graph", "topology", path), text) for path, text in flaws)
-    errors = first_lines(chain(lines, (f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws)))
+    errors = first_lines(chain(lines, (f"{source}: {path} {text}{_owner(document, path)}" for path, text in flaws)))
     if errors:
         raise ScenarioError(errors)
     del document["sensors"]
@@ -256,7 +256,7 @@ def _vehicle_of(
     return vehicles.get(model, ARDRONE2)
 
 
-def _whose(document: dict[str, Any], path: str) -> str:
+def _owner(document: dict[str, Any], path: str) -> str:
     """Return " (drone 'drone3')" for a path inside a drone's entry, and likewise for a cluster's."""
     match = re.match(r"(drone|cluster)s\[(\d+)\]", path)
     entries = document.get(f"{match[1]}s") if match else None

@@ -112,7 +112,7 @@ class _Reader:
         if self._count > VALUES_MAX:
             raise _refusal(f"there are more than {VALUES_MAX} keys and values", event)
         if isinstance(event, events.ScalarEvent):
-            return _word(event.value) if event.implicit[0] else event.value
+            return _plain_scalar(event.value) if event.implicit[0] else event.value
         if depth == DEPTH_MAX:
             raise RecursionError
         return self._list(depth + 1) if isinstance(event, events.SequenceStartEvent) else self._map(depth + 1)
@@ -141,7 +141,7 @@ def _refusal(problem: str, event: Any) -> MarkedYAMLError:
     return MarkedYAMLError(None, None, problem, event.start_mark)
 
 
-def _word(text: str) -> Any:
+def _plain_scalar(text: str) -> Any:
     for _, pattern, first, meaning in _WORDS:
         if text[:1] in first and pattern.match(text):
             return meaning(text)
@@ -158,7 +158,7 @@ def _real(text: str) -> float:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes strings that `_word` would read as another type."""
+    """Quotes strings that `_plain_scalar` would read as another type."""
 
 
 _DIRECTIVE = re.compile(r"^\ufeff?%", re.MULTILINE)

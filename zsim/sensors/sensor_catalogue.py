@@ -291,7 +291,7 @@ def in_channel_units(sensors: dict[str, Any], where: str) -> tuple[Any, list[Fau
         section = sensors.get(name)
         if not isinstance(section, dict):
             continue
-        read[name] = section = _of_kalibr(section, f"{where}.{name}", wrong) if name == "imu" else dict(section)
+        read[name] = section = _from_kalibr(section, f"{where}.{name}", wrong) if name == "imu" else dict(section)
         for channel in kind.channels:
             model, path = section.get(channel.settings), f"{where}.{name}.{channel.settings}"
             if isinstance(model, dict):
@@ -299,7 +299,7 @@ def in_channel_units(sensors: dict[str, Any], where: str) -> tuple[Any, list[Fau
     return read, wrong
 
 
-def _of_kalibr(section: dict[str, Any], where: str, wrong: list[Fault]) -> dict[str, Any]:
+def _from_kalibr(section: dict[str, Any], where: str, wrong: list[Fault]) -> dict[str, Any]:
     read = {key: value for key, value in section.items() if key not in KALIBR}
     for key, path in KALIBR.items():
         if key not in section:

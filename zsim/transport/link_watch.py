@@ -35,9 +35,9 @@ LOOK_S = 0.05  # wall time between checks
 STALL_BYTES = 1 << 16  # unacknowledged bytes at which a link is watched; the kernel accepts 0.4 MB or more (measured)
 STALL_S = 0.1  # wall time within which a live far end acknowledges something, in addition to …
 ROUND_TRIPS = 3.0  # … this many of its round trips
-HELD_BYTES, HELD_S = 1 << 20, 1.0  # limits for a reader that keeps reading, but never catches up
-FRESH_S = 0.2  # wall time between updates of the sessions at the far ends
-SPARED, SPARED_S = 3, 60.0  # a session whose links are closed this often within this time is kept out …
+BACKLOG_MAX_BYTES, BACKLOG_MAX_S = 1 << 20, 1.0  # limits for a reader that keeps reading, but never catches up
+REFRESH_PERIOD_S = 0.2  # wall time between updates of the sessions at the far ends
+CLOSURES_MAX, CLOSURES_WINDOW_S = 3, 60.0  # a session whose links are closed this often within this time is kept out …
 EXCLUSION_S = 30.0  # … for this time
 REPORT_PERIOD_S = 10.0  # wall time between reports on one session
 
@@ -93,7 +93,7 @@ class LinkWatch:
         self._wall_s = wall_s
         self._backlogs: dict[str, _Backlog] = {}
         self._far_ends: dict[str, FarEnd] = {}
-        self._refreshed_s = -FRESH_S
+        self._refreshed_s = -REFRESH_PERIOD_S
         self._times: dict[str, list[float]] = {}  # wall times at which links were closed, by session
         self._reported_s: dict[str, float] = {}  # wall time of the last report, by session
         self._excluded_until_s: dict[str, float] = {}
@@ -143,10 +143,10 @@ class LinkWatch:
         backlog = self._backlogs.setdefault(address, _Backlog(acknowledged, now_s, now_s))
         if acknowledged != backlog.acknowledged:
             backlog.acknowledged, backlog.moved_s = acknowledged, now_s
-        if held_bytes < HELD_BYTES:
+        if held_bytes < BACKLOG_MAX_BYTES:
             backlog.low_s = now_s
         stall_s = STALL_S + ROUND_TRIPS * round_trip_s
-        return now_s - backlog.moved_s >= stall_s or now_s - backlog.low_s >= HELD_S
+        return now_s - backlog.moved_s >= stall_s or now_s - backlog.low_s >= BACKLOG_MAX_S
 
     def _is_excluded(self, address: str, now_s: float) -> bool:
         if now_s >= max(self._excluded_until_s.values(), default=now_s):
@@ -155,7 +155,7 @@ class LinkWatch:
         return far_end is not None and now_s < self._excluded_until_s.get(far_end.session, now_s)
 
     def _far_end(self, address: str, now_s: float) -> FarEnd | None:
-        if now_s - self._refreshed_s >= FRESH_S:
+        if now_s - self._refreshed_s >= REFRESH_PERIOD_S:
             self._refreshed_s = now_s
             self._far_ends = self._link.far_ends()
         return self._far_ends.get(address)
@@ -177,7 +177,7 @@ class LinkWatch:
         self._backlogs.pop(address, None)
         times = self._times.setdefault(far_end.session, [])
         times.append(now_s)
-        if len(times) >= SPARED and now_s - times[-SPARED] < SPARED_S:
+        if len(times) >= CLOSURES_MAX and now_s - times[-CLOSURES_MAX] < CLOSURES_WINDOW_S:
             self._excluded_until_s[far_end.session] = now_s + EXCLUSION_S
         # a link without a backlog, such as that of a session kept out, is not reported
         if (

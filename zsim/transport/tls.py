@@ -132,7 +132,7 @@ def peer_fault(identity: Identity, endpoint: str) -> str | None:
         if error.verify_code not in _MISNAMED:
             return f"the listener's certificate is refused ({error.verify_message}); {REMEDY}"
     except ssl.SSLError as error:
-        return _words(error, endpoint)
+        return _error_text(error, endpoint)
     except OSError:
         return None
     try:
@@ -155,7 +155,7 @@ def _client(identity: Identity) -> ssl.SSLContext:
     return context
 
 
-def _words(error: ssl.SSLError, endpoint: str) -> str | None:
+def _error_text(error: ssl.SSLError, endpoint: str) -> str | None:
     """Return the text of a handshake error; None if the next attempt may succeed."""
     reason = error.reason or ""
     if "EXPIRED" in reason:

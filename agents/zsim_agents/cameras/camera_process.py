@@ -134,8 +134,8 @@ class CameraProcess(RunProcess):
     def join(self) -> None:
         """Join, so that the world waits for this process, and catch up with a run that has begun.
 
-        Before the run has begun, no truth can have been missed; querying for it is avoided, since replies to a query
-        may overtake earlier publications.
+        A reply to the first query shows that the run has begun. Otherwise no truth can have been missed, and there is
+        no second query after joining, since replies to a query may overtake earlier publications.
         """
         has_begun = bool(self._link.get(keys.truth("*"), timeout_s=QUERY_TIMEOUT_S))
         self._participant.announce()
@@ -151,7 +151,7 @@ class CameraProcess(RunProcess):
         self._draw()
 
     def _finish(self) -> None:
-        """Publish the pictures due by the end of the run, once its last truth has arrived."""
+        """Publish the pictures due by the end of the run; wait up to DRAIN_S for its last truth."""
         end_s = time.monotonic() + DRAIN_S
         self._draw()
         while self._truths.newest_ns < self._participant.now_ns and time.monotonic() < end_s:
@@ -202,8 +202,8 @@ class CameraProcess(RunProcess):
     def _due(self) -> list[tuple[_CameraStream, int]]:
         """Return the due pictures as pairs of camera and picture number, and count those that are too old as dropped.
 
-        The cameras take turns, starting with the one whose last picture is oldest, so that a process that is too slow
-        drops pictures of all cameras alike.
+        Those due before the first call are not counted. The cameras take turns, starting with the one whose last
+        picture is oldest, so that a process that is too slow drops pictures of all cameras alike.
         """
         newest_ns = self._truths.newest_ns
         if newest_ns < 0:
@@ -220,7 +220,7 @@ class CameraProcess(RunProcess):
         return [(stream, number) for _, number, stream in sorted(due, key=lambda each: (each[0], each[2].last))]
 
     def _expose(self, stream: _CameraStream, number: int) -> None:
-        """Render and publish a picture, or drop it if it is too late."""
+        """Render and publish a picture, or drop it if it is too late or the truth around its time is missing."""
         start_ns = time.perf_counter_ns()
         t_sample_ns = stream.exposure_ns(number)
         health = self._participant.health
@@ -385,7 +385,7 @@ class _CameraStream:
         return round(number * 1e9 / self.camera.rate_hz)
 
     def last_due(self, t_ns: int) -> int:
-        """Return the number of the newest picture available at `t_ns`; -1 before the first."""
+        """Return the number of the newest picture available at `t_ns`; < 0 before the first."""
         due_ns = t_ns - self.latency_ns
         number = int(due_ns * self.camera.rate_hz / 1e9) + 1
         while number >= 0 and self.exposure_ns(number) > due_ns:

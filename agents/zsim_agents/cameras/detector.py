@@ -6,10 +6,10 @@ follow from the hat's circular outline, which rotors may partly hide: wherever a
 the picture, its apparent radius is the angle a with sin a = r / d.
 
 Edge points are found by searching inwards from outside, in all directions around the centroid of the covered pixels.
-A circle is fitted to every run of consecutive points that contains half of them; the circle that best explains all
-points determines which of them lie on the outline. Circles x^2 + y^2 = 2 a x + 2 b y + c are fitted by least squares
-(I. Kasa, IEEE Trans. Instrum. Meas. 25, 1976) in the tangent plane of the unit sphere at the ball, where the outline is
-a circle wherever the ball is in the picture.
+A circle is fitted to every run of consecutive points that contains just over half of them; the circle that best
+explains all points determines which of them lie on the outline. Circles x^2 + y^2 = 2 a x + 2 b y + c are fitted by
+least squares (I. Kasa, IEEE Trans. Instrum. Meas. 25, 1976) in the tangent plane of the unit sphere at the ball, where
+the outline is a circle wherever the ball is in the picture.
 """
 
 import math
@@ -30,8 +30,9 @@ Picture = NDArray[np.uint8]
 Levels = NDArray[np.float32]
 
 PIXELS_MAX = 1920 * 1080 * 2  # maximum number of pixels to decode, twice the limit for a camera in a scenario
-LEVEL_MIN = 24  # minimum R - G of magenta, out of 255; smaller differences are noise
-SHARE_MIN = 0.3  # minimum (R - G) / R of magenta
+# R - G of magenta is at least LEVEL_MIN + SHARE_MIN R, out of 255; smaller differences are noise
+LEVEL_MIN = 24
+SHARE_MIN = 0.3
 BLUE_SHARE = 0.2  # minimum (B - G) / (R - G) of magenta (the paper's has 0.59); lower values are orange or red
 BLUE_WEIGHT = 1.5  # reduction of the magenta level per unit of missing blue
 AREA_MIN_PX = 2  # minimum area of a region's box at half the resolution
@@ -129,12 +130,12 @@ class HatDetector:
         self._half = max(1, lens.width // 2), max(1, lens.height // 2)
 
     def seen(self, picture: Picture) -> tuple[Seen, ...]:
-        """Return the hats in a picture of the camera, (height, width, 3) in B, G, R, largest first."""
+        """Return the hats in a picture of the camera, (height, width, 3) in B, G, R, roughly largest first."""
         found = [self._hat(picture, box) for box in self._boxes(picture)]
         return tuple(hat for hat in found if hat is not None)
 
     def _boxes(self, picture: Picture) -> list[_Box]:
-        """Return boxes around magenta regions at half the resolution, largest first."""
+        """Return boxes around magenta regions at half the resolution, in order of their largest pieces."""
         blue, green, red = cv2.split(cv2.resize(picture, self._half, interpolation=cv2.INTER_AREA))
         level = cv2.subtract(red, green)
         strong = cv2.addWeighted(level, 1.0, red, -SHARE_MIN, 0.5 - LEVEL_MIN)
@@ -154,7 +155,7 @@ class HatDetector:
         return merged
 
     def _hat(self, picture: Picture, box: _Box) -> Seen | None:
-        """Return the hat in a box at half the resolution; None if there is none, or the picture's edge cuts it off."""
+        """Return the hat in a box at half the resolution; None if it cannot be measured, or the edge cuts it off."""
         u, v, width, height = (2 * side for side in box)
         margin = MARGIN_PX + max(width, height) // 6
         u0, v0, u1, v1 = u - margin, v - margin, u + width + margin, v + height + margin
@@ -198,7 +199,7 @@ class Outline(NamedTuple):
         ray: unit vector to the circle's centre, in K.
         radius_rad: the ball's apparent radius; NaN if no circle was found.
         share: visible share of the circle.
-        rough_px: root mean square distance of the edge points from the circle.
+        rough_px: root mean square distance from the circle of the edge points that belong to it.
         centre, radius: standard deviations of the centre, per axis, and of the radius, over that of an edge point.
     """
 
@@ -248,7 +249,7 @@ def _covered(level: Levels, core: Picture, dilated: Picture, peak: float) -> Lev
 
 
 def _roundness(covered: Levels) -> float:
-    """Return the ratio of the smaller to the larger principal variance of the covered area; 0 if it is empty."""
+    """Return the ratio of the smaller to the larger principal variance of the covered area; 0 below one pixel."""
     moments = cv2.moments(covered)
     area = moments["m00"]
     if area < 1:
@@ -402,7 +403,7 @@ def _cost(points: NDArray, circle: Circle, noise: float) -> float:
 
 @portable
 def _mark_best_circle(points: NDArray, noise: float) -> bool:
-    """Mark the points on the circle that explains all points best; return False if there are too few."""
+    """Mark the points on the circle that explains all best; return False if they are too few or collinear."""
     count = len(points)
     min_cost, best = math.inf, (0.0, 0.0, 0.0)
     for first in range(count):

@@ -251,7 +251,7 @@ def _ellipsoid(middle: float, length: float, width: float, height: float, points
 
 
 def _blade_points(look: DroneLook, size: float, t_s: float, exposure_s: float, speeds: Array) -> Array:
-    """Return the sweeps of blades during an exposure, (..., R BLADES (SECTOR + 1), 3) [m; B]: hub, then arc, of each.
+    """Return the blades' sweeps in an exposure, (..., R BLADES (SECTOR_POINTS + 1), 3) [m; B]: hub, then arc, of each.
 
     The truth contains no rotor angles, so speed times time is used; the difference is invisible.
 
@@ -276,7 +276,7 @@ class DroneImage(NamedTuple):
     Attributes:
         box: the part of the picture that contains the drone: u0, v0, u1, v1.
         pixels: coordinates of the model's points, then of its blades' sweeps, in sixteenths of a pixel,
-            (P + R BLADES (SECTOR + 1), 2).
+            (P + R BLADES (SECTOR_POINTS + 1), 2).
         scale: factor from dimensions of the AR.Drone [m] to pixels, which includes the drone's relative size.
         blur: kernel of the drone's motion during the exposure; None if it hardly moves.
         is_from_above: whether the camera is above the drone's rotors.
@@ -535,10 +535,11 @@ def bgr(colour: Array) -> tuple[float, float, float]:
 
 
 class SurfaceImager:
-    """Draws surfaces for one camera: triangles (T, 9) in the format of zsim.scenario.surroundings, with both sides.
+    """Draws surfaces for one camera: two-sided triangles (T, 9) in the format of zsim.scenario.surroundings.
 
     Each triangle has a uniform colour and is drawn, among drones and obstacles, in order of the distance to its centre.
-    Edges are not antialiased, so that no gaps show between neighbours.
+    Edges are not antialiased, so that no gaps show between neighbours; exceptions are triangles that reach behind the
+    camera, or whose edges the lens visibly bends.
     """
 
     def __init__(self, view: View, triangle: Array, brightness: float) -> None:

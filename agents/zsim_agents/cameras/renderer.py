@@ -153,7 +153,7 @@ class Renderer:
 
 
 class _Noise:
-    """Noise of an image sensor, drawn once and added to each picture at a different offset; sigma in grey levels."""
+    """Noise of an image sensor, drawn once, added to each picture at a pseudo-random offset; sigma in grey levels."""
 
     def __init__(self, seed: int, name: str, shape: tuple[int, int], sigma: float) -> None:
         height, width = shape
@@ -179,7 +179,7 @@ class _Noise:
 
 
 def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
-    """Return an undistorted view that covers the lens's field of view, and the map that distorts its picture."""
+    """Return an undistorted view of the lens's field, up to WIDENING_MAX, and the map that distorts its picture."""
     lens = view.lens
     half = np.abs(view.plane).max(axis=(0, 1)) * (lens.fx, lens.fy)
     half_max = np.array([lens.width, lens.height]) * WIDENING_MAX / 2
@@ -355,7 +355,7 @@ def _extremes(size: tuple[int, int], linear: Sequence[float]) -> tuple[float, fl
 
 
 def half_plane(size: tuple[int, int], linear: Sequence[float], threshold: float) -> Points:
-    """Return the polygon in a picture where a u + b v + c >= least; with fewer than three points, it is empty."""
+    """Return the polygon in a picture where a u + b v + c >= `threshold`; with fewer than three points, it is empty."""
     a, b, c = linear
     corners = _rectangle(*size)
     excess = [a * u + b * v + c - threshold for u, v in corners]

@@ -43,14 +43,14 @@ class StateEstimate(NamedTuple):
 class DroneEstimator(Protocol):
     """Estimates the state of one drone.
 
-    A class may have three more methods, which a process uses when it takes over from one that died. `snapshot(self)`
+    A class may have three more methods, which let a process take over from one that died. `snapshot(self)`
     returns the state of the estimator as a map of plain values and arrays (`zsim.contract.snapshot.State`), and
     `restore(self, state)` restores it in a new object, which then continues bit-identically. If these two are missing,
     `warm_start(self, last)` is called with the last published `zsim.contract.flight_messages.Estimate`.
 
     Args:
         drone: the drone's section of the scenario: sensors with mounts, rates and error models; start position.
-        environment: gravity and magnetic field.
+        environment: the section of the scenario with gravity and magnetic field.
         estimation: settings of the scenario's estimators.
         gate_s: interval between gates [s].
     """
@@ -63,7 +63,7 @@ class DroneEstimator(Protocol):
         The readings of a gate come in order of arrival, then of sensor name; some may be late or missing.
 
         Args:
-            sensor: "imu", "gps", "mag", "baro", "sonar", "flow", or a user's sensor.
+            sensor: "imu", "gps", "mag", "baro", "sonar", "flow", "sightings", or a user's sensor.
             message: the sensor's message, such as `zsim.contract.messages.Imu`, measured at its `t_sample_ns`.
         """
         ...

@@ -22,7 +22,7 @@ from zsim_agents.estimation.joint_filter import ClusterBanks
 
 
 class Estimator(Agent):
-    """Passes the messages on `drone/{d}/sensor/*` to the estimators: a bank, or one object of a user's class per drone.
+    """Passes the messages on `drone/{d}/sensor/*` to the estimators: banks, or one object of another class per drone.
 
     The agent is named after the first of its drones, and also serves under the names of the others.
 

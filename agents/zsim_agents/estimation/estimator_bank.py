@@ -81,7 +81,7 @@ class EstimatorBank:
     """Fuses the sensors of several drones; `i` is a drone's index in the given order.
 
     Between two gates, readings of different sensors may arrive in any order. Duplicates are ignored; readings that are
-    older than the sensor's last one, not finite, or outside their innovation gate are refused and counted.
+    older than the sensor's last one, too old, not finite, or outside their innovation gate are refused and counted.
 
     Attributes:
         counted: name of each sensor, in the order of publication, and the columns of its counts of used and refused

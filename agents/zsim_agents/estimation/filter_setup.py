@@ -52,19 +52,19 @@ from zsim_agents.estimation.strapdown import (
 Array = NDArray[np.float64]
 
 LINK_LATENCY_S = 0.4  # s; design choice: latency that a radio and sparse telemetry add for an external drone
-LEVELLING_S = 60.0  # s; long against manoeuvres of seconds, short against the gyroscope's drift
-CLONE_EVERY_S = 0.1  # s; design choice: process noise over half this interval is small against any sensor's noise
+LEVELLING_S = 60.0  # s; long compared with manoeuvres of seconds, short compared with the drift of the gyroscope
+CLONE_EVERY_S = 0.1  # s; design choice: process noise over half of it is small compared with any sensor's noise
 CLONE_SHARE_MIN = 0.01  # of a reading's variance; design choice: less process noise since its sampling is negligible
 COMPASS_SIGMA_RAD = 2.0 * SET_DOWN_SIGMA_RAD  # rad; design choice: noisier readings do not initialise the heading
 ROOF_DISTANCE_MAX_M = 0.01  # m; design choice: a drone that starts this close to an obstacle stands on it
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
 VELOCITY_SIGMA_M_S = 1.0  # m/s: a start at rest or in gentle flight
 TILT_SIGMA_RAD = 0.05  # rad: ground that is level to 3 deg
-GYRO_BIAS_MIN = math.radians(0.01)  # rad/s: bias assumed if the scenario has none
-GYRO_WALK_MIN = math.radians(1e-4)  # rad/s/sqrt(s): random walk assumed if the scenario has none
+GYRO_BIAS_MIN = math.radians(0.01)  # rad/s: minimum of the bias's assumed standard deviation
+GYRO_WALK_MIN = math.radians(1e-4)  # rad/s/sqrt(s): minimum of the assumed random walk
 ACCEL_SIGMA_MIN = 0.02  # m/s^2 per sample: error of sampling and of the trapezoidal rule
 GYRO_SIGMA_MIN = 2e-4  # rad/s per sample: the same error for the gyroscope
-# Limit of the summed changes of three axes, in sigmas of the accelerometer: noise gives 3.4 on average, 1.5 in spread
+# Limit of the summed changes of three axes, in sigmas of the accelerometer: noise gives a mean of 3.4, sigma 1.5
 JOLT_SIGMAS = 10.0
 JOLT_MIN_M_S2 = 1.0  # m/s^2 between samples: above rotor vibration in flight; ground contact causes tens of m/s^2
 # Time for which a sensor is refused continuously before the variances of the states it observes are increased, so that
@@ -348,14 +348,15 @@ def innovation_limits(gate_probability: float) -> Array:
 def white_sigma(error: ErrorModel, rate_hz: float) -> float:
     """Return the standard deviation of an error's white part per sample, in the channel's unit.
 
-    It combines noise, density * sqrt(rate) and the converter's rounding (uniform: quantum^2/12) in quadrature.
+    It combines noise without a correlation time, density * sqrt(rate) and the converter's rounding
+    (uniform: quantum^2/12) in quadrature.
     """
     noise = 0.0 if error.correlation_time_s else error.noise
     return math.sqrt(el.square(noise) + el.square(error.density) * rate_hz + el.square(error.quantum) / 12.0)
 
 
 def accel_sigma(imu: ImuConfig) -> float:
-    """Return the accelerometer's white noise per sample [m/s^2]."""
+    """Return the standard deviation of the accelerometer's white noise, at least ACCEL_SIGMA_MIN [m/s^2]."""
     return max(white_sigma(imu.accel_m_s2, imu.rate_hz), ACCEL_SIGMA_MIN)
 
 

@@ -16,7 +16,7 @@ Array = np.ndarray
 IMU, GPS, MAG, BARO, SONAR, FLOW = (SENSORS.index(name) for name in ("imu", "gps", "mag", "baro", "sonar", "flow"))
 SIZES = (6, 6, 3, 1, 1, 3)  # number of values in a reading of each sensor
 VALUES_MAX = max(SIZES)
-CHANNELS = 4  # maximum biases per sensor: two channels, each with a constant or random walk and a Gauss-Markov process
+CHANNELS = 4  # maximum number of biases per sensor: two per channel, a constant or random walk and a Gauss-Markov one
 
 _MOMENT_FIELDS = (
     Field("t", "s"),
@@ -65,7 +65,7 @@ SENSOR = columns(  # settings of a sensor
         Field("R_BS", "1", 9),
         Field("down_B", "1", 3),
         Field("patience", "s"),
-        Field("correlated", "unit^2"),  # variance of the first channel's Gauss-Markov process
+        Field("correlated", "unit^2"),  # variance of the GPS position's Gauss-Markov process
     ),
 )
 

@@ -247,7 +247,7 @@ def _grow(rows: Rows, i: int, t_s: float) -> None:
 
 @portable
 def use_sightings(rows: Rows, sightings: Array, hat_B: Vector) -> None:
-    """Use the sightings of a gate one by one; count those that match no hat as refused."""
+    """Use the sightings of a gate one by one; count those that are implausible or match no hat as refused."""
     claimed = np.zeros(rows.nominal.shape[0], dtype=np.bool_)
     HJ, S, y = np.zeros((3, rows.joint.shape[0])), np.zeros((3, 3)), np.zeros(3)
     for m in range(sightings.shape[0]):

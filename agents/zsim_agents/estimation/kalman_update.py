@@ -1,7 +1,7 @@
 """Linear algebra of the filter: prediction of a covariance, innovation gates, and updates with stacked measurements.
 
 All functions are compiled. Prediction and update follow filterpy's ExtendedKalmanFilter (Joseph form), against which
-tests compare them. A joint covariance J, (D, D) with D = N n, contains the error states of N drones one after another,
+tests compare them. A joint covariance J, (D, D) with D = N n, covers the error states of N drones one after another,
 n states each (see filter_setup).
 """
 
@@ -14,7 +14,7 @@ from zsim.math.linear import product_with
 
 Array = np.ndarray
 DOF_MAX = 6  # rows of the largest block, a GPS fix with position and velocity
-JOSEPH_MAX = 24  # maximum states for the Joseph form: with more (clones), its n^3 products would dominate the run time
+JOSEPH_MAX = 24  # maximum number of states for the Joseph form: with more (clones), its n^3 products would be too slow
 
 
 @portable

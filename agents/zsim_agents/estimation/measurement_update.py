@@ -1,4 +1,4 @@
-"""The aiding readings of a drone in a gate: checked on arrival, compared with dead reckoning, used in one update.
+"""The aiding readings of a drone in a gate: checked in order of arrival, compared with dead reckoning, fused.
 
 A reading is compared with the state at the time of its sample and tested by an innovation gate; readings that pass
 correct the nominal state, the biases and the covariance.
@@ -61,7 +61,7 @@ from zsim_agents.estimation.strapdown import (
     write_minus_cross,
 )
 
-ROWS_MAX = 32  # maximum rows of a stacked update; further measurements of a gate go into a second one
+ROWS_MAX = 32  # maximum number of rows of a stacked update; further measurements of a gate go into a second one
 YAW = ATTITUDE + 2  # index in the error state
 VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and larger squares would impair the precision of all other states
 SQUARE_MAX = 1e8  # maximum squared innovation, in squared units; more would impair the covariance's precision
@@ -77,8 +77,8 @@ COSINE_MIN = 0.1  # minimum cosine between the sonar's ray and the vertical; bey
 def accept(rows: Rows, i: int, reading: Array) -> bool:
     """Return whether to use an aiding reading at the end of the gate.
 
-    A reading that is out of order, too old or not finite is counted as refused; duplicates and sonar readings without
-    an echo are not counted.
+    A reading that is out of order, too old, not finite, or without a GPS fix or optical flow is counted as refused;
+    duplicates, sonar readings without an echo and readings of unused sensors are not counted.
     """
     row, counts, setting, layout = rows.nominal[i], rows.counts[i], rows.setting[i], rows.layout[i]
     kind = int(reading[READING.sensor])
@@ -105,7 +105,7 @@ def accept(rows: Rows, i: int, reading: Array) -> bool:
 
 @inlined
 def start_heading(rows: Rows, i: int, P: Array, t_s: float, readings: Array, first: int, after: Array) -> None:
-    """Initialise the heading from the magnetometer, or else from the scenario."""
+    """Initialise the heading from a compass; without a compass, or after HEADING_WAIT_S, from the scenario."""
     row, counts, setting = rows.nominal[i], rows.counts[i], rows.setting[i]
     if math.isnan(row[NOMINAL.t_first_gate]):
         row[NOMINAL.t_first_gate] = t_s
@@ -244,7 +244,7 @@ def add_biases(rows: Rows, i: int, kind: int, H: Array, at: int, out: Array) -> 
 
 @inlined
 def limit_heading_effect(P: Array, H: Array, expected: Array, at: int) -> None:
-    """Limit the effect of flow on the heading, in two rows from `at` on, to the part of the motion that is certain.
+    """Limit the effect of flow on the attitude, in two rows from `at` on, to the part of the motion that is certain.
 
     A heading error rotates the velocity. At rest the velocity error would thereby yield spurious heading information
     (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for designing consistent EKF SLAM
@@ -273,7 +273,7 @@ def write_variance(reading: Array, setting: Array, variance: Array, at: int) -> 
 
 @inlined
 def is_refuted(rows: Rows, i: int, kind: int) -> bool:
-    """Return whether a drone that lately saw drone i, or was seen by it, trusts its own sensor: then drone i's errs."""
+    """Return whether a drone that recently saw drone i, or was seen by it, trusts its sensor: then drone i's errs."""
     for j in range(rows.sighted.shape[0]):
         last_s = max(rows.sighted[i, j], rows.sighted[j, i])
         is_trusted = math.isnan(rows.nominal[j, NOMINAL.refused_since + kind]) and rows.counts[j, COUNT.used + kind] > 0

@@ -2,7 +2,7 @@
 
 I. Mas, S. Curi, R. Sánchez Peña, "Open-source Multi-UAV Simulator for the ROS Environment", section III: Madgwick's
 filter computes the attitude from gyroscopes and accelerometers; an extended Kalman filter, used "due to the non-linear
-dynamics", fuses dead reckoning and a GPS receiver to a position. The heading is not measured: it starts at the
+dynamics", fuses dead reckoning with GPS fixes into a position estimate. The heading is not measured: it starts at the
 scenario's value, and only GPS fixes of a moving drone correct it.
 
 Dead reckoning integrates the velocity u that the aircraft measures in its heading frame:

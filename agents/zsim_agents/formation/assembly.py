@@ -132,7 +132,7 @@ def planned_assembly(
     min_m, distance = separation_share * gains.separation_min_m, straight_separation(start_W, goal_W)
     if distance < min_m - ROUNDING_M:
         finding = f"on the paths to their positions two drones come within {distance:.2f} m"
-        remedy = f"certain if starts and goals are each {math.sqrt(2.0) * gains.separation_min_m:.2f} m apart"
+        remedy = f"guaranteed if starts and goals are each {math.sqrt(2.0) * gains.separation_min_m:.2f} m apart"
         raise RefusalError(f"{finding}; allowed: {min_m:g} m or more, {remedy}")
     return Assembly(start_W, goal_W, c, _min_duration_s(start_W, goal_W, gains), gains), order
 
@@ -147,7 +147,7 @@ def assign(starts_m: Array, goals_m: Array) -> NDArray[np.intp]:
 
     starts, goals = np.asarray(starts_m, float), np.asarray(goals_m, float)
     if starts.ndim != 2 or starts.shape != goals.shape or starts.shape[1] not in (2, 3):
-        raise ValueError(f"found starts {starts.shape} and goals {goals.shape}; must both be (n, 3)")
+        raise ValueError(f"found starts {starts.shape} and goals {goals.shape}; must both be (n, 2) or (n, 3)")
     if not (np.isfinite(starts).all() and np.isfinite(goals).all()):
         raise ValueError("a position is not finite; all must be")
     return linear_sum_assignment(((starts[:, None] - goals[None]) ** 2).sum(axis=2))[1]

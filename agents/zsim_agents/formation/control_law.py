@@ -47,7 +47,7 @@ class FormationGains:
     """Parameters of a law, validated with the scenario. For those not listed here, see `RobotLimits`.
 
     Attributes:
-        k_1_s: proportional gain [1/s]; 0.5 to 0.8 works well; above about 2 a drone's velocity loop makes it unstable.
+        k_1_s: proportional gain [1/s]; 0.5 to 0.8 works well; above about 2, a drone's velocity loop is too slow.
         integral_1_s2: integral gain [1/s^2]; removes the offset due to wind; 0 switches it off.
         integral_max_m_s, integral_max_rad_s: limits of the integral term for lengths and for angles.
         separation_min_m: minimum distance between two robots, for references and for the guard.
@@ -298,7 +298,7 @@ class Grants:
 
     def _not_granted(self, law: type, subject: str, field: str, line: str) -> UserCodeError:
         where = f"{plugin.full_name(law)} reads {subject}, which clusters.{self._cluster}.{field} does not grant"
-        return UserCodeError(f"{where}; write `{line}` there, or leave it out of the class")
+        return UserCodeError(f"{where}; write `{line}` in the cluster, or remove the call from the class")
 
     def snapshot(self) -> State:
         newest = ((key, self._newest[name][index]) for key, (name, index) in self._slots.items())
@@ -395,7 +395,7 @@ def limited(
 ) -> tuple[float, int, int]:
     """Write the saturated and guarded velocities (n, 3) and yaw rates (n,) for r_dot (4n,).
 
-    Return the factor of the saturation, then the result of `hold_apart`. limits_of are the fields of a RobotLimits:
+    Return the factor of the saturation, then the result of `hold_apart`. limit_values are the fields of a RobotLimits:
     passing a tuple to compiled code takes longer than the computation.
     """
     limits = RobotLimits(*limit_values)
@@ -446,7 +446,9 @@ def near_pairs(p_W: Array, distance_max_m: float) -> PairTable:
 
 @portable
 def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limit_values: float) -> tuple[int, int]:
-    """Modify commands in place until every pair separates at least at its required rate (see `guard`).
+    """Modify commands in place so that every pair separates at least at its required rate (see `guard`).
+
+    After GUARD_SWEEPS sweeps, some pairs may still fall short of it.
 
     Return the numbers of modified pairs and of pairs closer than the alarm threshold. In `order`, (n, n), the former
     are numbered from 1 above the diagonal and the latter below it; all other entries are zero.

@@ -86,7 +86,7 @@ class Engagement:
         law: Callable[[ClusterSpace, FormationGains], ControlLaw] = ProportionalLaw,
     ) -> None:
         if len(drones) != space.n:
-            raise ValueError(f"cluster: {len(drones)} drones; allowed: {space.n}, as its cluster space has")
+            raise ValueError(f"cluster: {len(drones)} drones; allowed: {space.n}, one per robot of its cluster space")
         self.space = space
         self.drones = tuple(drones)
         self.gains = gains or FormationGains()
@@ -131,7 +131,7 @@ class Engagement:
             return self._climb(gate)
         if self._phase != "landing":
             return self._output(gate, "")
-        # a take-off command may still be in transit: idle only after some time on the ground
+        # a take-off command may still be in transit: idle only some time after the request to land
         if gate.is_down and gate.t_s - self._landing_s >= RESEND_S:
             self._phase = "idle"
         modes = self._mode_commands(gate, "land", AIRBORNE | {"taking_off"})
@@ -202,7 +202,7 @@ class Engagement:
 
     def _submit(self, request: FlightRequest) -> str | None:
         if self._gate is None:
-            return "no gate was seen yet; ask again when the simulation runs"
+            return "no gate has been seen yet; ask again when the simulation runs"
         try:
             self._grant(request, self._gate)
         except REFUSALS as refusal:
@@ -212,7 +212,7 @@ class Engagement:
     def _grant(self, request: FlightRequest, gate: GateInput) -> None:
         if request is Order.TAKE_OFF:
             if self._phase != "idle":
-                raise RefusalError(f"phase is {self.phase}; take-off is possible when idle")
+                raise RefusalError(f"phase is {self.phase}; must be idle to take off")
             if fault := self.check.take_off_fault(gate, self.plan.assembles):
                 raise RefusalError(fault)
             self._phase = "taking_off"
@@ -226,7 +226,7 @@ class Engagement:
             self._modes_sent_s.clear()
         elif request is Order.REJOIN:
             if self._phase != "engaged" or not self._fault:
-                raise RefusalError(f"phase is {self.phase}; possible when held by a fault")
+                raise RefusalError(f"phase is {self.phase}; must be held by a fault")
             if fault := self._control_fault(gate):
                 raise RefusalError(fault)
             c = self._checked if self._checked.size else self.guidance.value(gate.t_s)[0]
@@ -238,7 +238,7 @@ class Engagement:
         elif isinstance(request, Assemble):
             self._grant_assembly(request, gate)
         elif self._phase != "engaged":
-            raise RefusalError(f"phase is {self.phase}; possible when engaged")
+            raise RefusalError(f"phase is {self.phase}; must be engaged")
         elif self._fault:
             raise RefusalError(self._fault)
         elif isinstance(request, Order):
@@ -253,7 +253,7 @@ class Engagement:
             self.guidance.resume(gate.t_s)
             return
         if self._phase != "assembling":
-            raise RefusalError(f"phase is {self.phase}; possible when assembling, or when held on request")
+            raise RefusalError(f"phase is {self.phase}; must be assembling, or held on request")
         if fault := self._arrival_fault(gate) or self.check.engagement_fault(gate):
             raise RefusalError(fault)
         if self._assembly is None:
@@ -268,7 +268,7 @@ class Engagement:
     def _grant_assembly(self, request: Assemble, gate: GateInput) -> None:
         """Assign the drones to the positions of a formation and start their flight there."""
         if self._phase not in ("assembling", "engaged") or self._fault:
-            raise RefusalError(self._fault or f"phase is {self.phase}; possible when assembling or engaged")
+            raise RefusalError(self._fault or f"phase is {self.phase}; must be assembling or engaged")
         if fault := self._arrival_fault(gate) or self.check.assembly_fault(gate):
             raise RefusalError(fault)
         if self._phase == "engaged":
@@ -357,7 +357,7 @@ class Engagement:
             try:
                 self.guidance.rejoin(self.check.value, gate.t_s)
             except REFUSALS as refusal:
-                self._fault, self._faultless_since_s = f"cannot go on: {refusal}", gate.t_s
+                self._fault, self._faultless_since_s = f"cannot continue: {refusal}", gate.t_s
             else:
                 self._fault, self._positions = "", None
                 self.law.reset()

@@ -1,9 +1,9 @@
 """Builds the engagement of a scenario's cluster from space, gains, law and plan, and rehearses it before the flight.
 
 A plan is checked before the flight, from the drones' start positions. It is refused if the guidance would certainly
-refuse it throughout the flight (the text then gives the factor by which its times must be stretched), or if it ends
-before any formation could start it. Limits are slightly wider than in flight, since the formation is never exactly at
-its start position; the guidance decides on cases in between, twice a second while the formation hovers.
+refuse it throughout the flight (if it is too fast, the text gives the factor by which to stretch its times), or if it
+ends before any formation could start it. Limits are slightly wider than in flight, since the formation is never exactly
+at its start position; the guidance decides on cases in between, twice a second while the formation hovers.
 """
 
 from __future__ import annotations
@@ -203,7 +203,7 @@ def gains_of(gains: Gains) -> FormationGains:
 def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
     """Raise PlanError for a plan that these drones cannot fly.
 
-    A plan without assemblies is not checked if the drones do not start in a valid formation.
+    The paths of a plan without assemblies are not checked if the drones do not start in a valid formation.
     """
     plan = cluster.plan
     assembles = plan.assemblies is not UNSET

@@ -166,7 +166,7 @@ class FlightCheck:
         self.value: Array = np.zeros(space.size)
         self.margin = 0.0
         self._spread = 0.0
-        self._no_frame: str | None = "nothing was observed yet"
+        self._no_frame: str | None = "nothing has been observed yet"
         self._flaw = (VALID, 0)  # first flaw of the observed gate under the limits in flight
         sigmas = limits.sigma_max_m, limits.yaw_sigma_max_rad
         self._start_limits = (AGE_MAX_S, *sigmas)

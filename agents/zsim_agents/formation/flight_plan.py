@@ -47,7 +47,7 @@ class Order(Enum):
 
     TAKE_OFF = "takeoff"  # all drones take off and climb vertically to the assembly height
     ENGAGE = "engage"  # close the formation's control loop at the present estimate, or resume after a hold
-    PAUSE = "hold"  # hover in formation until engaged again
+    PAUSE = "hold"  # hover in formation until engaged again, or stop rejoining
     REJOIN = "rejoin"  # lead each drone of a formation held by a fault back to its position individually
     LAND = "land"  # all drones land where they are
 

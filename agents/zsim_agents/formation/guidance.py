@@ -40,7 +40,8 @@ class Guidance:
 
     The formation's home (its target or trajectory) is kept separately from the reference being flown (a ramp onto it).
     A variable that a request does not name keeps its goal: the value from the last request that named it; initially
-    its value at engagement, or zero for the neutral variables (roll, pitch, phi_i, w_k).
+    its value at engagement, or zero for the neutral variables (roll, pitch, phi_i, w_k). While the home is a
+    trajectory, such a variable keeps its present value there.
 
     Methods that change the reference raise TrajectoryError, ExpressionError or SingularClusterError, and change
     nothing, if the path is not allowed.
@@ -151,7 +152,7 @@ class RampPlanner:
         The ramp and up to HORIZON_S of the reference are checked.
 
         Raises:
-            TrajectoryError: the ramp is too fast or too long, or leads through a forbidden state.
+            TrajectoryError: the ramp is too fast or too long, or the ramp or the reference contains a forbidden state.
         """
         from_s = max(start_s, onto.start_s) if isinstance(onto, Shifted) else start_s
         end_s = min(math.inf if onto.duration_s is None else onto.duration_s, from_s + HORIZON_S)
@@ -175,7 +176,7 @@ class RampPlanner:
         return ramp
 
     def fastest(self, start: tuple[Array, Array], onto: Reference, start_s: float) -> Ramp:
-        """Return a fast ramp within the speed limits, with unchecked path; TrajectoryError: it takes over an hour."""
+        """Return a fast ramp within the speed limits, its path unchecked; TrajectoryError: it would take over 1 h."""
         over_s = RAMP_MIN_S
         while over_s <= RAMP_MAX_S:
             ramp = ramp_onto(self._space, *start, onto, start_s, over_s)
@@ -183,8 +184,8 @@ class RampPlanner:
             if excess <= LOAD_TOLERANCE:
                 return ramp
             over_s *= max(min(excess, 10.0), RAMP_GROWTH)
-        limit = f"not reached within {RAMP_MAX_S:g} s at the robots' limits"
-        raise TrajectoryError(f"{limit}: too far, or it moves too fast")
+        limit = f"the target is not reached within {RAMP_MAX_S:g} s at the robots' limits"
+        raise TrajectoryError(f"{limit}: it is too far away, or moves too fast")
 
     def _peak_load(self, ramp: Ramp) -> float:
         times = np.linspace(ramp.start_s, ramp.start_s + ramp.over_s, RAMP_SAMPLES).tolist()
@@ -201,9 +202,9 @@ class RampPlanner:
             c, c_dot = reference.value(t_s)
             fault = formation_fault(self._space, c, self._gains, self._limits)
             if not fault and (share := self._load(c, c_dot)) > self._limits.share * LOAD_TOLERANCE:
-                fault = f"a robot moves at {share:.2f} of its limits; allowed: {self._limits.share:g}"
+                fault = f"a robot moves at {share:.2f} times its limits; allowed: {self._limits.share:g}"
             if fault:
-                return f"{t_s - from_s:.1f} s after its start {fault}" if t_s > from_s else fault
+                return f"{t_s - from_s:.1f} s into the part checked, {fault}" if t_s > from_s else fault
         return None
 
 

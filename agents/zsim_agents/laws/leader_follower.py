@@ -3,10 +3,11 @@
     leader      u_l = v_l* + b (p_l* - p_l)
     follower    u_i = k sum_{j in N_i} ((p_j - p_i) - (c_j - c_i))    (1)
 
-The leader knows the reference and receives no messages; followers do not know it, and receive messages of the leader
-only if it is a neighbour. With L_ff, the rows and columns of the followers in the Laplacian, their errors decay at the
-rate k lambda_min(L_ff). Without feed-forward, they lag a leader at velocity v by L_ff^-1 1 v / k, which grows along a
-chain. Mesbahi, Egerstedt, Graph theoretic methods in multiagent networks (2010), ch. 10.
+The leader knows the reference and uses messages only to avoid collisions; followers do not know the reference, and
+receive messages of the leader only if it is a neighbour. With L_ff, the rows and columns of the followers in the
+Laplacian, their errors decay at the rate k lambda_min(L_ff). Without feed-forward, they lag a leader at velocity v by
+L_ff^-1 1 v / k, which grows along a chain. Mesbahi, Egerstedt, Graph theoretic methods in multiagent networks (2010),
+ch. 10.
 """
 
 import numpy as np

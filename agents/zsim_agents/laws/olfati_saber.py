@@ -5,7 +5,7 @@
         - c1g (p_i - p_r) - c2g (v_i - v_r)                                             gamma: the common objective
 
 Olfati-Saber, Flocking for multi-agent dynamic systems: algorithms and theory, IEEE Trans. Automatic Control 51 (2006),
-Algorithms 2 and 3. u is an acceleration, which the pilot integrates to the commanded velocity. Each drone receives the
+Algorithms 2 and 3. u is an acceleration, which the pilot integrates to the commanded velocity. Each drone uses the
 messages of others within r; the last term uses the drone's own knowledge of the objective. Since several lattices are
 possible, the quality of the shape is measured by the deviation from d of the distances within r.
 """

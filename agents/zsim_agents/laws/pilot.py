@@ -121,7 +121,7 @@ class Pilot(Agent):
     """Flies one drone by a formation law; see the module's docstring.
 
     Raises:
-        ExpressionError: a reference is not an expression of t.
+        ExpressionError: a reference is not an expression of t, or has no value at its start.
     """
 
     Parameters: Any = PilotParameters

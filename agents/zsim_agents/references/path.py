@@ -1,7 +1,7 @@
 """Paths of one drone: position and rate over time, peak speeds and acceleration, and scaling to limits. Pure.
 
-A path is a minimum-snap polynomial, or a circle, helix or figure-8 flown in laps that begin and end at rest on the
-curve.
+A path is a piecewise polynomial, such as a minimum-snap path, or a circle, helix or figure-8 flown in laps that begin
+and end at rest on the curve.
 
 A path is a `Reference` of four variables, x, y, z [m; W] and yaw [rad, not wrapped]. Its time starts at 0; outside
 [0, duration_s] it rests at its nearer end.
@@ -33,7 +33,7 @@ GOLDEN = 0.6180339887498949  # (sqrt(5) - 1) / 2
 GOLDEN_STEPS = 40  # steps of a golden-section search; each leaves 0.62 of the interval, all leave 1e-10 of a piece
 SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # sampling of non-polynomial paths, before peaks are refined
 HORIZON_S = 600.0  # initial part of an endless path that is searched for peaks
-DIFFERENCE_S = 1e-4  # step of central differences of rates; relative error 1e-7 for motions with time scales of 1 s
+DIFFERENCE_S = 1e-4  # step of central differences of rates; relative error 2e-9 for motions with time scales of 1 s
 FACTOR_DIGITS = 3  # decimals to which the factor of a fitted path is rounded up
 SHARE = 0.8  # share of the drone's limits that a path may use, as in formations; the rest is left to the feedback
 # Minimum duration of a move (25 gates), maximum unless a longer one is requested, and its growth per step of the search
@@ -108,7 +108,7 @@ class PiecewisePolynomial:
         return PiecewisePolynomial(durations, self.coefficients[:count])
 
     def peaks(self) -> Peaks:
-        """Return the peaks over all pieces, with times accurate to 1e-10 of a piece."""
+        """Return the peaks over all pieces, with times accurate to 1e-8 of a piece, which rounding permits."""
         maxima = [(0.0, 0.0)] * 4
         for begin_s, duration_s, coefficients in zip(self.begins_s, self.durations_s, self.coefficients, strict=False):
             # in local time from 0 to 1, for good scaling

@@ -6,7 +6,7 @@ takeoff, land
 hold: come to rest and hover
 goto {position_m, yaw_deg, speed_m_s}: fly to a position at a cruise speed (default: the limits) and stop there
 goto {places_m, yaw_deg, speed_m_s, radius_m}: fly through positions, passing each within radius_m; 0: stop at each
-goto {position_m, yaw_deg, over_s}: fly to a position on a minimum-snap path that takes over_s
+goto {position_m, yaw_deg, over_s}: fly to a position on a minimum-snap path in over_s, or longer if the limits require
 follow {minimum_snap: [...], fit: true, ...}: fly to the start of a path, then along it; fields: FOLLOW_FIELDS
 """
 
@@ -192,7 +192,7 @@ class ReferencePilot(Agent):
             self._mode_ns = self._t_ns - round(RESEND_S * 1e9)
             return None
         if self._state not in AIRBORNE or self._is_over or t_s >= self._land_s:
-            state = "landed, or about to" if self._state in AIRBORNE else self._state
+            state = "about to land, or past its landing" if self._state in AIRBORNE else self._state
             raise DroneRequestError(f"{self._drone} is {state}; must be flying its reference: request takeoff first")
         position, rate = self._flight.value(t_s)
         flight = requested_flight(parsed, t_s, position, rate, self._spec, self._limits)
@@ -287,7 +287,7 @@ def read_request(op: str, args: Mapping[str, Any]) -> DroneRequest:
         raise DroneRequestError(f"is unknown; allowed: {', '.join(OPERATIONS)}")
     if op in WITHOUT_ARGUMENTS:
         if args:
-            raise DroneRequestError(f"{next(iter(args))!s:.40} is given; must have no arguments")
+            raise DroneRequestError(f"{next(iter(args))!s:.40} is given, but the request takes no arguments")
         return op  # type: ignore[return-value]
     kind = Goto if op == "goto" else DroneReference
     invalid = [f"{path} {text}" for path, text in faults(dict(args), kind)]
@@ -301,11 +301,11 @@ def read_request(op: str, args: Mapping[str, Any]) -> DroneRequest:
         raise DroneRequestError(f"{'; '.join(unused[:3])}; allowed: {', '.join(FOLLOW_FIELDS)}")
     if isinstance(parsed, Goto):
         if (parsed.position_m is None) != bool(parsed.places_m):
-            found = "is given beside" if parsed.places_m else "is missing, and so is"
+            found = "is given together with" if parsed.places_m else "is missing, and so is"
             raise DroneRequestError(f"position_m {found} places_m; must have one of them")
         if parsed.over_s and (parsed.places_m or parsed.speed_m_s):
             other = "places_m" if parsed.places_m else "speed_m_s"
-            raise DroneRequestError(f"over_s is {parsed.over_s:g} beside {other}; one of them must be left out")
+            raise DroneRequestError(f"over_s ({parsed.over_s:g}) and {other} are both given; leave one of them out")
     return parsed
 
 

@@ -32,20 +32,16 @@ REQUEST_UNICAST = b"\x01\x00\x00\x00"  # a program's request for navdata (ARDron
 MAGIC = 0x5566_7788
 MAGICS = (MAGIC, 0x5566_7789)  # the second is sent by newer firmware (npm ar-drone, parseNavdata.js)
 DEMO_RATE_HZ, FULL_RATE_HZ = 15, 200  # Developer Guide 7.1
-SECONDS_SHIFT, MICROSECONDS_MASK = (
-    21,
-    (1 << 21) - 1,
-)  # option `time`: seconds above, microseconds below (navdata_common.h)
+# Option `time`: seconds above, microseconds below (navdata_common.h)
+SECONDS_SHIFT, MICROSECONDS_MASK = 21, (1 << 21) - 1
 OPTION_HEADER = struct.Struct("<HH")  # tag and size of an option
 CHECKSUM_TAG = 0xFFFF
 GPS_TAG = 27  # in older SDKs, the tag of option zimmu_3000, of 12 bytes
 CLIENTS_MAX = 8  # maximum number of programs that receive navdata; a further one displaces the oldest
 REQUEST_PREFIXES = (b"\x01", b"Init")  # first bytes of a request for navdata (ARDroneLib; its Windows client)
 SECOND_NS = 1_000_000_000
-ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = (
-    512,
-    2048,
-)  # nominal scale and zero of the raw accelerometer (measured: 516 to 518, 2031 to 2038)
+# Nominal scale and zero of the raw accelerometer (measured: 516 to 518, 2031 to 2038)
+ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = 512, 2048
 GYRO_LSB_PER_DEG_S = 16.4  # scale of the raw gyro (measured on an aircraft)
 MAG_UT_PER_LSB = 0.3  # uT (AK8975 datasheet)
 MG_PER_UT = 10.0  # milligauss per microtesla

@@ -13,11 +13,8 @@ SIGNATURE = b"PaVE"
 VERSION = 2
 CODEC_H264 = 4
 HEADER_SIZE = 64  # bytes; later firmware appends four without a meaning
-WIDTH_PX, HEIGHT_PX, CODED_HEIGHT_PX = (
-    640,
-    360,
-    368,
-)  # displayed size; the coded height is a whole number of macroblocks
+# Displayed size; the coded height is a whole number of macroblocks
+WIDTH_PX, HEIGHT_PX, CODED_HEIGHT_PX = 640, 360, 368
 RATE_HZ = 30  # frames per second, for the encoder's rate control
 IDR_INTERVAL = 30  # frames; design choice: after a loss, decoding can resume within a second
 BIT_RATE = 1_000_000  # bit/s; the SDK's video:bitrate, 1000 kbit/s

@@ -1,7 +1,7 @@
 """The cameras of a run for pages: their names, the newest picture of each watched one, and the marks drawn on it.
 
 Pictures may come from any program, so each is checked before a browser decodes it. Frames: B of the drone; K of the
-camera: x right, y down, z ahead. Pixel (0, 0) is the centre of the picture's upper left pixel.
+camera: x right, y down, z ahead. Pixel coordinates (0, 0) are the centre of the picture's upper left pixel.
 """
 
 import math
@@ -31,8 +31,8 @@ SIGMAS = 2.0  # uncertainty of a hat's direction that its circle includes, in st
 FOLD_MAX = 1e-3  # maximum distance, in focal lengths, between a ray and the undistorted ray of its pixel
 NORM_MIN = 1e-6  # minimum norm of a quaternion, and minimum forward component of a ray relative to its norm
 AGE_MAX_NS = 300_000_000  # simulated; maximum time between a picture and sightings drawn on it: 3 pictures at 10 Hz
-PICTURE_BYTES_MAX = 1_000_000  # maximum size of a picture; ten such pictures a second fill 80 Mbit/s
-PIXELS_MAX = 1920 * 1200  # number of pixels of the largest camera in a scenario; a browser needs 4 bytes for each
+PICTURE_BYTES_MAX = 1_000_000  # maximum size of a picture; ten such pictures a second fill a link of 80 Mbit/s
+PIXELS_MAX = 1920 * 1200  # per picture; a scenario's cameras have 1920 × 1080 at most; a browser needs 4 bytes each
 JPEG_END = b"\xff\xd9"  # last bytes of a JPEG; ITU-T T.81, table B.1
 SUPPORTED_MARKERS = frozenset({0xC0, 0xC1, 0xC2})  # frames that browsers show: baseline, extended, progressive
 
@@ -65,7 +65,7 @@ class _WatchedCamera:
 class CameraFeed:
     """The cameras of one run, each named `DRONE/CAMERA`; only watched ones are subscribed to.
 
-    Cameras of drones that are not in the run are ignored; `hat_m` is the diameter of a hat [m].
+    Cameras that are not those of the run's drones are ignored; `hat_m` is the diameter of a hat [m].
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class CameraFeed:
             self._requests.pop(page, None)
 
     def picture(self, camera: str) -> CameraPicture | None:
-        """Return the newest picture of a camera; None before the first one, or if the camera is not watched."""
+        """Return a camera's newest valid picture; None before the first one, or if the camera is not watched."""
         with self._lock:
             watched = self._watched.get(camera)
             if watched is None:
@@ -148,7 +148,7 @@ class CameraFeed:
             return watched.picture
 
     def marks(self, camera: str) -> tuple[Mark, ...]:
-        """Return the marks on the newest picture: from a detector's sightings, or otherwise from the world's."""
+        """Return the marks on the newest picture: from a detector's sightings close in time, or else the world's."""
         with self._lock:
             watched, info = self._watched.get(camera), self._infos.get(camera)
             if watched is None or watched.picture is None or info is None:
@@ -221,7 +221,7 @@ class CameraFeed:
                 watched.sightings.setdefault(sample.key, deque(maxlen=SIGHTINGS_KEPT)).append(sightings)
 
     def _decode_picture(self, camera: str, payload: bytes) -> CameraPicture | None:
-        """Return a valid picture; count an invalid one as refused."""
+        """Return a picture; if it is invalid, count it as refused, and return None."""
         try:
             image: CameraImage = messages.decode(keys.camera(*camera.split("/")), payload)
             check_picture(image.data, image.width, image.height)
@@ -249,7 +249,7 @@ def _sighting_keys(camera: str) -> tuple[str, str]:
 
 
 def check_picture(data: bytes, width: int, height: int) -> None:
-    """Refuse data that is not a complete JPEG of a size [px], or is too large for a page.
+    """Refuse data that is not a complete JPEG of the given size [px], or that a page could not show.
 
     Raises:
         PictureError: what is wrong, in one line.
@@ -263,7 +263,7 @@ def check_picture(data: bytes, width: int, height: int) -> None:
         )
     if (frame.width, frame.height) != (width, height):
         size = f"{frame.width} × {frame.height}"
-        raise PictureError(f"JPEG is {size}, its message says {width} × {height}; must be the same")
+        raise PictureError(f"JPEG is {size}, but its message says {width} × {height}; must be the same")
     if width * height > PIXELS_MAX:
         raise PictureError(f"picture is {width} × {height}; must have {PIXELS_MAX} pixels at most")
 

@@ -69,7 +69,7 @@ DRONE_MODES = {
     "emergency": "Emergency",
     "reset": "Reset",
 }  # `return`, to the start, is not a mode of the firmware
-MODES_NEEDING_CONTROL = ("takeoff", "return", "reset")  # modes that need control; any page may land or stop a drone
+MODES_NEEDING_CONTROL = ("takeoff", "return", "reset")  # any operator's page may land or stop a drone
 DRONE_ICONS = {"takeoff": viser.Icon.PLANE_DEPARTURE, "return": viser.Icon.HOME, "reset": viser.Icon.REFRESH}
 
 
@@ -78,7 +78,7 @@ class ConsolePage:
 
     Args:
         gui: viser's controls; those of another run are removed.
-        report: called with the outcome of each request that is refused here, unsent.
+        report: called with the outcome of each request that is refused without being sent.
         show: shows or hides one of `SWITCHES` in the scene.
         choose_trail: sets the length of trails [s].
         request_return: returns a formation to its start, and lands it.
@@ -252,7 +252,7 @@ class PageForms:
         return form.drone.chosen if form else ""
 
     def use(self, client_id: int | None, drone: str) -> str:
-        """Give a page control of a drone's part of the run if that is free; otherwise return why it cannot."""
+        """Let a page take control of a drone's part of the run; return why it may not, empty if it may."""
         return self._desk.use(client_id, self._part_of(drone)) if client_id is not None else ""
 
     def move_rings(self, drones: DronePoses) -> None:
@@ -397,7 +397,7 @@ class DroneForm:
         self._rename()
 
     def refresh(self, run: RunCondition) -> None:
-        """Disable the buttons whose commands all of the drones would refuse."""
+        """Disable the buttons whose commands would be refused for each of the drones."""
         self._run = run
         refusals = [offered_refusals(run, partial(drone_refusals, drone=drone)) for drone in self.targets]
         for drone, each in zip(self.targets, refusals, strict=True):
@@ -411,7 +411,7 @@ class DroneForm:
         self._reasons.content = refusal_lines(DRONE_MODES, common) + shown
 
     def _request(self, mode: str) -> None:
-        """Request an operation that needs control, from all drones that would not refuse it."""
+        """Request an operation of all drones that would not refuse it, as far as the page may control them."""
         accepting = [drone for drone in self.targets if not drone_refusals(self._run, drone)[mode]]
         # If all would refuse, the answers state why, unless the condition has changed.
         drones = accepting or self.targets

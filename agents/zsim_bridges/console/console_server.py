@@ -57,9 +57,9 @@ REFUSAL_S = 2.0  # wall time; minimum between two refusals shown on a page: a dr
 NOTICE_S = 8.0  # wall time; how long a notification stays in the corner
 EVENTS_MAX = 20  # maximum number of events in `state`
 SILENT = "silent"  # replaces the clock's state while the world does not answer
-FEW_DRONES = 20  # number of drones from which on the picture rate is halved
+FEW_DRONES = 20  # with this number of drones or more, the picture rate is halved
 RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
-FAST_RATE = 4.0  # × real time; rate from which on the picture rate is halved, too, since the run needs the processors
+FAST_RATE = 4.0  # × real time; likewise at this rate of the run or above, since the run needs the processors
 
 
 class Console:
@@ -148,6 +148,8 @@ class Console:
 
     def remain(self, end_reason: Callable[[], str | None], is_abandoned: Callable[[], bool]) -> None:
         """Serve the pages of a finished run until there is a reason to end and the pages have copies of its files.
+
+        After OFFER_S, the console no longer waits for the copies.
 
         Args:
             end_reason: returns the reason, None while there is none.
@@ -279,7 +281,7 @@ class RunPage:
             self._update_tables(time.monotonic())
 
     def end(self, reason: str) -> None:
-        """Show that the run is over; called after `run`, which may not have noticed."""
+        """Show that the run is over; called after `run`, which may have returned before the end."""
         self._monitor.end(reason)
         self._monitor.update(time.monotonic())
         with self._server.atomic():
@@ -305,7 +307,7 @@ class RunPage:
         return self.orders.place(request)
 
     def permits(self, client_id: int, control: str) -> bool:
-        """Return whether a page may use a shared control; if not, show the reason on that page."""
+        """Return whether a page may use a shared control, which takes a free part; if not, show it the reason."""
         part = self._page.parts.get(control)
         refusal = "" if part is None else self.desk.use(client_id, part)
         if refusal and time.monotonic() - self._notified_s.get(client_id, -math.inf) > REFUSAL_S:
@@ -424,9 +426,10 @@ class RunPage:
         self._scene.draw_trails()
 
     def _on_outcome(self, outcome: RequestOutcome) -> None:
-        """Show a refusal in the corner of every page, and the outcome of a request among the events.
+        """Show a refusal in the corner of every page and among the events.
 
-        The world publishes no events about requests to formations.
+        Also log the acceptance of a request to a formation, of which the world publishes no event, and of one whose
+        completion can be observed.
         """
         if outcome.order and not self.orders.note(outcome):
             return
@@ -447,7 +450,7 @@ class RunPage:
         self._notify(event.subject, str(event.data.get("reason", event.text)))
 
     def _on_foreign_request(self, cluster: str, text: str) -> None:
-        """Notify every page of another client's request to a formation, since the last request takes effect."""
+        """Notify pages, except in a replay, of another client's request to a formation, which replaces earlier ones."""
         for client_id in () if self._run.is_replay else self._server.get_clients():
             self._notify_page("Control", "orange", client_id, text)
 
@@ -474,7 +477,7 @@ def picture_rate_hz(drones: int, rate: float) -> float:
 def console_state(
     run_id: str, views: ViewBuffer, time_monitor: TimeMonitor, shapes: Mapping[str, FormationShape | None]
 ) -> dict[str, Any]:
-    """Return the shown state of a run as plain data; called from another thread than the one that draws.
+    """Return the shown state of a run as plain data; called from a thread other than the one that draws.
 
     `shapes` are the formations' true shapes.
     """

@@ -70,7 +70,7 @@ class DroneRow(NamedTuple):
 
     @property
     def link_badness(self) -> float:
-        """How bad the drone's link, or its estimator's lag, is: 1 at the alarm threshold, infinite without a link."""
+        """How bad an external drone's link, or another's lag, is: 1 at the alarm threshold, infinite without a link."""
         drone = self.drone
         if not drone.is_external:
             return (drone.lag_ms or 0.0) / LAG_MAX_MS
@@ -123,7 +123,7 @@ class TableRows:
 
 
 class SensorRates:
-    """Derives one drone's sensor rates from irregular samples of its estimator's counts; drones may alternate."""
+    """Derives one drone's sensor rates from irregular samples of its estimator's counts; another drone restarts it."""
 
     def __init__(self) -> None:
         self._drone = ""
@@ -172,7 +172,7 @@ def drone_table(
     head = _head(
         ("", "selected for one command"),
         ("drone", ""),
-        ("state", "state of its firmware"),
+        ("state", "state of the drone's firmware"),
         ("z [m]", "height above the origin"),
         ("v [m/s]", "speed, including the climb"),
         ("hdg", "heading [deg], 0 = east, 90 = north"),
@@ -330,7 +330,7 @@ def event_table(newest_first: Iterable[EventRow]) -> str:
             f"<td style='text-align:right;color:{GREY}'>{event.t_ns / 1e9:.2f}</td><td>{kind}</td>"
             f"<td style='width:100%'><div class='zsim-event-text'>{count}{escape(event.text)}</div></td></tr>"
         )
-    head = _head(("t [s]", "simulated time of the newest"), ("event", ""), ("newest first", ""))
+    head = _head(("t [s]", "simulated time of the newest occurrence"), ("event", ""), ("newest first", ""))
     return _table(head + "".join(lines))
 
 

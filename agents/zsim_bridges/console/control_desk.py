@@ -1,7 +1,8 @@
 """Decides which page of the console is in control of which part of the run: a formation, or the run itself.
 
 A page takes control of a free part by using one of its controls. Another page must request the part, and gets it when
-the controlling page grants the request, is closed or is lost. Emergencies, landings and holds need no control.
+the controlling page grants the request, releases the part, is closed or is lost. Emergencies, landings and holds need
+no control.
 """
 
 import threading

@@ -56,7 +56,7 @@ ICONS = {
 }
 EXPRESSIONS = "x_c = 5 + 3*cos(0.1*t)\nyaw = 90 + 6*t"
 WAYPOINTS = "0: x_c = 5, y_c = 0\n20: x_c = 5, y_c = 6"
-EXPRESSION_UNITS = "t in seconds, lengths in metres, angles in degrees as on the sliders; sin and cos are of radians"
+EXPRESSION_UNITS = "t in seconds, lengths in metres, angles in degrees as on the sliders; sin and cos take radians"
 WAYPOINT_UNITS = "seconds from the start, lengths in metres, angles in degrees as on the sliders"
 HORIZONTAL_RANGE_M = 50.0  # range around the drones' starts; design choice: as far as a page shows a formation well
 HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # range of heights; design choice: clear of the ground, and within sight
@@ -83,7 +83,7 @@ class FormationForm:
     """Controls of one formation.
 
     Args:
-        report: called with the outcome of each request that is refused here, unsent.
+        report: called with the outcome of each request that is refused without being sent.
         request_return: moves a formation above the middle of its drones' starts, and lands it there.
         show_preview: shows in the scene the path that would be flown; None: removes it.
 
@@ -184,10 +184,10 @@ class FormationForm:
         moved = {name: value for name, slider in self._sliders.items() if (value := slider.pop_value()) is not None}
         if self.request_target(moved):
             for name in moved:
-                self._sliders[name].hold(wall_s)  # a value that is only previewed returns to the goal after a while
+                self._sliders[name].hold(wall_s)  # after a while, a slider with a mere preview shows the goal
 
     def request_target(self, shown: dict[str, float]) -> bool:
-        """Request values in the units of the page; return whether they are within their ranges."""
+        """Request values in the units of the page; return whether they and the duration are within their ranges."""
         duration_s = float(self._duration.value)
         range_refusals = [self._ranges[name].refusal(value) for name, value in shown.items()]
         refusals = [
@@ -278,7 +278,7 @@ class FormationForm:
             add("Fly the waypoints", lambda: self._fly(lambda: parse_waypoints(points.value, self._ranges)))
 
     def _prefill(self) -> None:
-        """Fill in the formation's position as both the first and the second waypoint, for the operator to edit.
+        """Fill in the formation's position and yaw as both the first and the second waypoint, for the operator to edit.
 
         The waypoints then follow the formation until they are edited.
         """
@@ -331,7 +331,7 @@ class VariableSlider:
         self._held = _HeldValue(float(self._slider.value), float("nan"), wall_s)
 
     def follow(self, goal: float, wall_s: float) -> None:
-        """Show the formation's goal [m, rad], unless the slider was moved and the formation still moves to its value.
+        """Show the formation's goal [m, rad], unless the slider's value is still to be sent, or being flown to.
 
         The slider extends to the value that it shows; requests remain limited to the range.
         """

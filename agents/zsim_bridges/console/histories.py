@@ -103,7 +103,7 @@ class CanvasTrails:
     def add(self, t_s: float, p_W: Array) -> None:
         """Add positions (N, 3) [m] at a simulated time, NaN for a drone that is not in the view.
 
-        In a flight, positions are skipped while no drone has moved.
+        Positions are skipped within SPACING_S of others; in a flight, also while no drone has moved by SPACING_M.
         """
         points = self._points
         if not self._is_replay and points.times and t_s < points.times[-1]:
@@ -181,7 +181,7 @@ class VariableHistory:
     def add(
         self, t_s: float, desired: Sequence[float] | None, value: Sequence[float] | Array, true: Array | None
     ) -> bool:
-        """Add a point at a simulated time, unless the last one is too recent; return whether it was added.
+        """Add a point at a simulated time, unless another one is too close in time; return whether it was added.
 
         `desired`, `value` and `true` have shape (size,), m and rad; None where unknown.
         """

@@ -40,7 +40,7 @@ SETTLED_S = 1.5  # wall; time after which a view must show who has acquired a dr
 RATE_MAX = 5.0  # × real time; at a higher rate nobody can fly manually, and the firmware mistakes pauses for silence
 CLIMB_SHARE = 0.5  # ratio of climb to horizontal speed; design choice: height is harder to judge on a page
 YAW_RATE_RAD_S = math.radians(45.0)  # design choice: a full turn in 8 s
-SPEED_M_S = 1.5  # speed towards a waypoint; design choice: that of the paper's formations
+SPEED_M_S = 1.5  # speed towards a waypoint; design choice: the default speed limit of formations
 WAYPOINT_REACHED_M = 0.5  # distance from a waypoint at which a drone proceeds to the next one
 WAYPOINTS_MAX = 50  # maximum number per drone; design choice: more would no longer be manual flight
 BRAKE_S = 1.0  # time constant of braking before the fence; design choice: three times the lag of the velocity loop
@@ -158,7 +158,7 @@ def _fenced(velocity_W: Vector, pose: DronePose, fence: Geofence) -> Vector:
 
 
 def _too_fast(rate: float) -> str:
-    slower = f"to fly by hand set the rate to {RATE_MAX:g} or less"
+    slower = f"to fly by hand, set the rate to {RATE_MAX:g} or less"
     return f"simulated time passes {rate:.1f} × as fast as wall time; {slower}" if rate > RATE_MAX else ""
 
 
@@ -241,7 +241,7 @@ class ManualFlight:
             self._release_drones(self._wall_s())
 
     def take(self, page: Any, drone: str, take_over: bool, request: str = "") -> FlightAnswer:
-        """Acquire a drone for a page; with `take_over`, even from its present commander, by the priority of operators.
+        """Acquire a drone for a page; with `take_over`, even from its present commander, by operators' priority.
 
         A request repeated with the same id is carried out once; a page that has reconnected keeps its drone.
         """
@@ -292,7 +292,8 @@ class ManualFlight:
         """Fly the page's drone to a point [m; W], at the drone's present height unless `z_m` is given.
 
         Args:
-            append: append the point to the present waypoints instead of replacing them.
+            append: append the point to the present waypoints instead of replacing them; after WAYPOINTS_MAX, replace
+                the last one.
         """
         with self._lock:
             flight = self._flights.get(page)
@@ -453,7 +454,8 @@ class ManualFlight:
 class PageFlying:
     """Flies single drones for the pages of one run; pages are identified by viser's number.
 
-    `on_return_over` is called with each drone or formation that ends its return without landing, and the reason.
+    `on_return_over` is called with each drone or formation whose return ends without a landing, and the reason, unless
+    a formation's return was refused or followed by another request from the console.
     """
 
     def __init__(
@@ -598,7 +600,7 @@ class ReturnFlights:
                     self._formations.pop(name, None)
 
     def _continue_drone(self, drone: str) -> bool:
-        """Send a drone to its start, or land it if it is above; return whether it is still returning."""
+        """Send a drone to its start, or land it if it is above its start; return whether it is still returning."""
         key, pose = ReturningDrone(drone), self._status_of(drone).pose
         answer = self._control.steer(key, None)  # keeps the flight alive, as an open page does
         if answer.state == "none":
@@ -619,7 +621,7 @@ class ReturnFlights:
         """Land a formation once it has arrived above its drones' starts; return whether it is still returning."""
         view = self._clusters().get(name)
         if self._client.cluster_requests[name] != returning.requests or view is None:
-            return False  # another request was made
+            return False  # another request was made, or there is no view of the formation
         if view.phase != "engaged":
             self._on_return_over(name, f"return of {name} is over: it is {view.phase}")
             return False

@@ -1,9 +1,9 @@
 """Requests of operators: sent in threads of their own, and tracked until they have taken effect.
 
 `CommandClient` sends requests and modes, and reports the outcome of each. Orders must not be lost: `OrderBook` sends
-each until the world has carried it out or refused it. The page chooses the id of an order, and repeats the order until
-it is answered; the console carries out each id once, and repeats an order that the world has not confirmed: the answer
-may be missing, a radio may have lost the command, or its stamp may have become too old while a process stalled. Other
+each until it is carried out, refused or replaced. The page chooses the id of an order, and repeats the order until it
+is settled; the console carries out each id once, and repeats an order that has not been confirmed: the answer may be
+missing, a radio may have lost the command, or its stamp may have become too old while a process stalled. Other
 requests are sent once; `PendingRequests` reports when an accepted one is done.
 """
 
@@ -138,7 +138,7 @@ class CommandClient:
         self._submit(self._requests.submit, outcome, self._request, keys.CONTROL, op, args)
 
     def seek(self, t_s: float, step: bool) -> None:
-        """Move a replay to a simulated time; with `step`, also play one gate there, which a paused replay shows."""
+        """Move a replay to a simulated time; with `step`, also play one gate there, so that a paused one shows it."""
 
         def act() -> str:
             refusal = self._request(keys.CONTROL, "seek", {"t_s": t_s})
@@ -155,7 +155,7 @@ class CommandClient:
         return {}
 
     def read(self, act: Task) -> bool:
-        """Run a task that reads data in another thread; return whether it was scheduled."""
+        """Run a task that reads data, in another thread; return whether it was scheduled."""
         try:
             self._requests.submit(act)
         except RuntimeError:  # closed
@@ -186,7 +186,9 @@ class CommandClient:
         self._submit(self._requests.submit, outcome, self._request, keys.cluster_control(cluster), op, args)
 
     def send_mode(self, drones: Sequence[str], mode: str, order: str = "") -> None:
-        """Make drones take off, land, stop at once or leave the emergency, whoever commands them.
+        """Make drones take off, land, stop at once or leave the emergency state, with an operator's priority.
+
+        An emergency has the highest priority, and is sent even if the drone cannot be acquired.
 
         Modes of one drone are sent in the order in which they were requested, except for an emergency: it does not wait
         for earlier ones, and these are not sent after it.
@@ -274,7 +276,7 @@ class CommandClient:
         return SUPERSEDED if is_superseded else ""
 
     def _release(self, drone: str, answered_before: int) -> None:
-        """Release a drone once the world has answered the mode, which needs the operator's priority until then."""
+        """Release a drone once the world has answered the mode, or after ACCEPTANCE_TIMEOUT_S without an answer."""
         self._views.await_answer(drone, answered_before, ACCEPTANCE_TIMEOUT_S)
         with suppress(ZsimError):  # the run has ended
             self._request(keys.CONTROL, "release", {"drone": drone})
@@ -354,7 +356,7 @@ class DroneQueue:
 
 
 class OrderRequest(Struct, frozen=True, forbid_unknown_fields=True):
-    """An order from a page, which repeats it with the same id until it is confirmed."""
+    """An order from a page, which repeats it with the same id until it is confirmed or refused."""
 
     op: Literal["emergency", "land", "hold", "acknowledge"]
     id: Name = ""
@@ -490,10 +492,10 @@ class OrderBook:
                         self._settle(order, target, "refused", target.reason)
 
     def update(self, states: Mapping[str, str], t_ns: int, *, paused: bool) -> None:
-        """Settle orders that have taken effect, and repeat the others.
+        """Settle orders that have taken effect, were replaced or can no longer be flown; repeat the others.
 
         `states` has the states of drones and the phases of formations at `t_ns`. A command that is accepted while the
-        run is paused takes effect when it continues.
+        run is paused takes effect when it continues, and is not repeated before.
         """
         with self._lock:
             self._paused = paused
@@ -548,7 +550,10 @@ class OrderBook:
         return order
 
     def _replace_earlier(self, order: _Order) -> None:
-        """Settle earlier orders for the same targets; an emergency also replaces those of formations that it stops."""
+        """Replace earlier orders for the same targets, but an emergency only by another.
+
+        An emergency also replaces the orders of formations that it stops.
+        """
         target_names = set(order.targets)
         if order.op == "emergency":
             target_names |= {name for name, drones in self._members.items() if target_names.issuperset(drones)}
@@ -612,7 +617,7 @@ class PendingRequests:
         self._pending: dict[str, PendingRequest] = {}
 
     def accept(self, subject: str, op: str, text: str, args: Mapping[str, Any]) -> bool:
-        """Keep a request; return whether its completion can be observed."""
+        """Keep a request if its completion can be observed; return whether it can."""
         is_observable = op in PHASES_DONE or op in STATES_DONE or (op == "target" and bool(args.get("values")))
         if is_observable:
             self._pending[subject] = PendingRequest(subject, op, text, args.get("values", {}))

@@ -9,7 +9,7 @@ This is the only file that uses internals of viser 1.1 and websockets, which hav
 - refuse one page the use of a control that all pages share (`_guard_controls`),
 - find a control by its id, or the id of a control (`control_ids`, `control_id`, `PageControls`),
 - show a JPEG on a camera's frustum without decoding it (`show_jpeg`),
-- wake the event loop safely from other threads, as viser's message buffer does (`AnyThreadEvent`),
+- let viser's message buffer set its event safely from other threads (`AnyThreadEvent`),
 - write to a page that closes meanwhile without a warning (`Buffer`).
 """
 
@@ -68,7 +68,7 @@ CLIENT_HEADER = "X-Zsim-Client"  # key of a page, which maps to viser's number
 COPIED_HEADER = "X-Zsim-Copied"  # sent once a page has its copies from a console that is exiting
 SECRET_HEADER = "X-Zsim-Console"  # its value, a secret, is required by viser's server
 ALL_ADDRESSES = ("0.0.0.0", "::")
-PAGES_MAX = 50  # maximum open at once, counted separately for operators and viewers: viewers must not exclude operators
+PAGES_MAX = 50  # maximum number open at once, separately for each role: viewers must not exclude operators
 HEARTBEAT_S = 20.0  # period of pings, which detect a page whose machine has disappeared
 CLOSE_S = 0.3  # wall; timeout used twice on exit: for requests in progress, and for pages to close their sockets
 POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'none'; form-action 'none'"
@@ -146,7 +146,7 @@ class RunFiles:
         return {"files": files, "leaves": self._is_exiting}
 
     def offer(self, within_s: float, is_abandoned: Callable[[], bool]) -> None:
-        """Tell pages to copy the files before the console exits; wait until all open ones have, or `is_abandoned`."""
+        """Tell pages to copy the files before the console exits; wait `within_s` at most, and not if `is_abandoned`."""
         self._is_exiting = True
         deadline_s = time.monotonic() + within_s
         while (now_s := time.monotonic()) < deadline_s and not is_abandoned():
@@ -249,7 +249,7 @@ class HttpProxy:
         if role is None:
             return _missing_token()
         if page_request.token:
-            # The token moves to a cookie. The path is relative, since a reverse proxy may serve the page below another.
+            # The token moves to a cookie. The path is relative, since a reverse proxy may add a prefix to it.
             response = web.Response(status=303, headers={**HEADERS, "Location": f".{page_request.path}"})
             token_role = self._tokens.role_of_address(page_request)
             if token_role is not None:
@@ -377,7 +377,9 @@ def _page_request(request: web.Request) -> PageRequest:
 
 
 class PageTokens:
-    """Decides who may open pages in which role: by tokens, or, if only this machine can connect, by a request's origin.
+    """Decides who may open pages in which role: by tokens, or, if only this machine can connect, by the Host header.
+
+    Requests from pages of other servers are refused.
 
     Args:
         listen, port: the address at which pages are served.

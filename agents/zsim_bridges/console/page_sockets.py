@@ -1,7 +1,7 @@
 """The two sockets that each page opens: one for actions, one for pictures from the drones' cameras.
 
 Pictures have a separate socket, since a megabyte of them on a slow link must not delay the answers to a stick. A socket
-is closed on an invalid message. Viewers may look and choose; operators may also fly and play records.
+is closed on an invalid or forbidden message. Viewers may look and choose; operators may also fly and play records.
 """
 
 import asyncio
@@ -162,7 +162,7 @@ class ActionSockets:
             flying.control.lose(page)
 
     def act(self, text: str, role: str, page: Any = None) -> dict[str, Any] | None:
-        """Carry out an action (JSON) from a page in a role; return the answer, None if it is invalid or not permitted.
+        """Carry out an action (JSON) from a page in a role; return the answer, None for a forbidden or invalid one.
 
         `page`, its socket, identifies the page that flies a drone.
         """

@@ -130,7 +130,7 @@ def drone_on_ray(
 
 
 def shown_names(names: Sequence[str]) -> list[str]:
-    """Return names, without their common prefix if there are more than FULL_NAMES_MAX and none would become empty."""
+    """Return names; of more than FULL_NAMES_MAX, omit the common prefix up to a digit, unless one would be empty."""
     if len(names) <= FULL_NAMES_MAX:
         return list(names)
     common = takewhile(lambda column: len(set(column)) == 1 and not column[0].isdigit(), zip(*names, strict=False))

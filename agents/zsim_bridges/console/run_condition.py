@@ -30,7 +30,7 @@ Severity = Literal["amber", "red"]
 BATTERY_LOW_PERCENT, BATTERY_EMPTY_PERCENT = 20.0, 10.0  # thresholds of amber and red; the AR.Drone warns at the first
 UPSIDE_DOWN_DEG = 90.0
 LAG_MAX_MS = 200.0  # an estimator's lag above which an alarm is raised: ten gates of 20 ms
-SIGMA_HIGH_M = 2.0  # σ of a position above which an alarm is raised: the largest distance between the paper's drones
+SIGMA_HIGH_M = 2.0  # σ of a position above which an alarm is raised: the default minimum separation of drones
 LINK_AGE_MAX_MS, LINK_LOSS_PERCENT = 500.0, 10.0  # alarm thresholds; PX4 leaves offboard mode after the first
 LOSS_NAMES = {
     "death": "dead",
@@ -42,7 +42,7 @@ LOSS_NAMES = {
 }
 """Kinds of events that report the loss of a process or drone, with the names of the alarms."""
 RETURN_KINDS = frozenset({*ADMISSIONS, "silent_end", "leave"})  # kinds of events that end a loss; `drop` does not
-OFF_REFERENCE_M = 2.0  # alarm threshold of a length's error: the smallest distance between the paper's drones
+OFF_REFERENCE_M = 2.0  # alarm threshold of a length's error: the default minimum separation of drones
 FLOWN_PHASES = frozenset({"assembling", "engaged"})  # phases in which a formation's controller flies all of its drones
 
 
@@ -201,7 +201,7 @@ class Losses:
             self._remove({event.subject, *map(str, event.data.get("serves") or ())})
 
     def note_health(self, name: str, health: Health) -> None:
-        """Process a health message: a process with another host or pid than the lost one replaces it."""
+        """Process a health message: a process whose host or pid differs from that of the lost one replaces it."""
         lost = self.current.get(name)
         pid = None if lost is None else lost.data.get("pid")
         if lost is not None and pid and (lost.data.get("host"), pid) != (health.host, health.pid):
@@ -450,7 +450,7 @@ def preflight_refusal(run: RunCondition, drones: Collection[str]) -> str:
 
 
 def is_held_by_fault(run: RunCondition, cluster: str) -> bool:
-    """Return whether a formation is held by a fault rather than on request."""
+    """Return whether a formation is held by a fault, not on request (even if the guard parts drones meanwhile)."""
     phase, reason = run.phases.get(cluster, ("", ""))
     on_request = any(note in reason for note in (HELD_ON_REQUEST, GUARD_PARTS)) and REJOINING not in reason
     return phase == "held" and not on_request

@@ -37,7 +37,7 @@ TARGET_TEXTS = {
     "drone": "a drone",
     "world": "the world, hence all drones",
     "link": "the messages between two processes A/B; a drone's radio is affected by the kind radio",
-    "radio": "the radio between drones and others: the world's, or a formation's",
+    "radio": "the radio of all drones (target: world), or of a formation's drones",
     "process": "a process",
 }
 """Descriptions of the targets of faults."""
@@ -124,7 +124,7 @@ class FaultForm:
     """Controls to inject faults: common ones of a chosen drone, or any fault.
 
     Args:
-        report: called with the outcome of each request that is refused here, unsent.
+        report: called with the outcome of each request that is refused without being sent.
         scenario: names the drones and processes.
         drones: drones of the run, with the names of their rotors; without such names, those of the AR.Drone are used.
     """
@@ -262,7 +262,7 @@ def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
 
 
 class OrderButton:
-    """A button for an order, which its page repeats until it is confirmed; the button is HTML, not a control of viser.
+    """A button for an order, which its page repeats until it is confirmed or refused; HTML, not a control of viser.
 
     Args:
         target: target of the order: {"drone": name}, with several names separated by commas, or {"cluster": name}.
@@ -329,7 +329,7 @@ def set_refusals(controls: Mapping[str, Any], refusals: Mapping[str, str]) -> No
 
 
 def offered_refusals(run: RunCondition, refusals_of: Callable[[RunCondition], Mapping[str, str]]) -> dict[str, str]:
-    """Return the refusals; orders are also offered while the world is silent, and emergencies always."""
+    """Return the refusals; orders are offered even while the world is silent, and emergencies always."""
     orders = {op: reason for op, reason in refusals_of(run._replace(silent_s=0.0)).items() if op in ORDERS}
     if "emergency" in orders:
         orders["emergency"] = ""

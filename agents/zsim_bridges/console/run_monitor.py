@@ -136,7 +136,7 @@ class RunMonitor:
         return self.pending.pop_done(views.clusters, self.condition.drones)
 
     def head(self, wall_s: float) -> dict[str, Any]:
-        """Return the head of the page as plain data; called from another thread than `update`."""
+        """Return the head of the page as plain data; called from a thread other than that of `update`."""
         t_ns = self.views.drones.t_ns if self.views.drones else 0
         name, clock, rows = self.run.scenario.name, self.time_monitor.clock, self.board.rows(wall_s)
         return page_head(name, self.now(), clock, t_ns, rows, self._single_drones, self._world, self.record_s)
@@ -422,7 +422,7 @@ class TimeMonitor:
                     self.clock, self._clock_read_s, self._answered_s = clock, start_s, self._awake.now_s()
 
     def now_ns(self) -> int:
-        """Return simulated time for a stamp, after a poll if it may be too old; takes 2 ANSWER_TIMEOUT_S at most."""
+        """Return simulated time for a stamp, after a poll, of ANSWER_TIMEOUT_S at most, if it may be too old."""
 
         def is_old() -> bool:
             rate = max(1.0, self.clock.rate) if self.clock else 1.0  # the measured rate is 0 at the beginning of a run

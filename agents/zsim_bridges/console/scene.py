@@ -5,7 +5,7 @@ the ring around the chosen drone belongs to one page.
 
 Multirotors are meshes of simple solids in B: x ahead, y left, z up, origin at the centre of mass. They look like the
 AR.Drone, scaled by the length of their arms, with their own rotors. Lengths are in metres; those of solids are the
-AR.Drone's. They are for display only and enter no computation.
+AR.Drone's. The meshes are for display only and do not enter the simulation.
 """
 
 import math
@@ -99,7 +99,7 @@ class RunScene:
         self._members = {name: [run.names.index(each) for each in drones] for name, drones in run.members.items()}
         self._drawn_ghosts: dict[str, Any] = {}
         self.drones: DronePoses | None = None  # newest poses of the drones
-        self.shapes: dict[str, FormationShape | None] = {}  # true shapes by formation; None if a drone is missing
+        self.shapes: dict[str, FormationShape | None] = {}  # true shapes by formation; None if undefined
         self.previews: dict[str, Array] = {}  # paths (n, M, 3) [m] that formations would fly
         self.trails = CanvasTrails(len(run.names), is_replay=run.is_replay)
         robots = sum(space.n for space in run.spaces.values())
@@ -160,7 +160,7 @@ class RunScene:
             self.nodes.wind(self.drones)
 
     def shapes_of(self, drones: DronePoses) -> dict[str, FormationShape | None]:
-        """Return the formations' true shapes by name; None for a formation of which a drone is missing."""
+        """Return the formations' true shapes by name; None if a drone is missing or the shape is singular."""
         present, yaw = drones.present, frames.heading(drones.q_WB)
         return {
             name: formation_shape(space, drones.p_W[members], yaw[members]) if present[members].all() else None
@@ -363,7 +363,7 @@ class SceneNodes:
                 label.text, label.position = texts[i]
 
     def trails(self, segments: Array, owners: NDArray[np.int64]) -> None:
-        if not len(segments):  # a replay was rewound: remove the old trails
+        if not len(segments):  # remove the old trails, as when a replay was rewound
             segments, owners = np.tile(HIDDEN, (1, 2, 1)), np.zeros(1, dtype=np.int64)
         colours = np.repeat(self._trail_colours[owners][:, None], 2, axis=1)
         if self._trail_node is None:

@@ -109,13 +109,13 @@ class ViewBuffer:
         self.faults: tuple[Fault, ...] = ()  # injected faults, planned and active
         self.log = EventLog(observer.name)
         self.losses = Losses()
-        self.failsafes: dict[str, Event] = {}  # last automatic landing or stop of each drone, until its next mode
+        self.failsafes: dict[str, Event] = {}  # last automatic landing or stop by drone, until another mode follows
         self.recent_faults: deque[Fault] = deque(maxlen=FAULTS_KEPT)  # the most recently begun faults
         self.end = ""  # why the run ended, by its last event; empty while it continues
         self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that the console causes
 
     def open(self) -> None:
-        """Subscribe, and read the values published last."""
+        """Subscribe, and read the last list of faults."""
         links = map(keys.link, sorted(self.external))
         for expression in ("view/**", keys.FAULTS, keys.RADIO, "process/*/health", *links):
             self._link.declare_subscriber(expression, self._on_publication)
@@ -186,7 +186,7 @@ class ViewBuffer:
         return [f for f in self.faults if f.from_ns <= now_ns and (f.until_ns is None or f.until_ns > now_ns)]
 
     def lag_ms(self, received: ReceivedEstimate) -> float:
-        """Return an estimator's lag [ms]: from its health, or from the age of its view if that is not fresh."""
+        """Return an estimator's lag [ms]: from its health or, without it or a fresh view, from its view's age."""
         health = self.healths.get(received.process)
         if health is not None and received.is_fresh:
             return health.lag_ns / 1e6

@@ -65,7 +65,7 @@ class TooManyError(ZsimError):
 
 
 class UnknownError(ZsimError):
-    """A drone or a cluster that the run does not have."""
+    """A drone, cluster or camera that the run does not have, or an invalid process name."""
 
 
 class MethodError(ZsimError):
@@ -218,7 +218,7 @@ def json_to_payload(key: str, value: Any) -> bytes:
     An integer field also accepts a number such as 20000000.0, as written by languages that have only doubles.
 
     Raises:
-        DecodeError: the data is not a message of the key; a key outside the contract accepts anything.
+        DecodeError: the data is not a message of the key; on other keys, a number exceeds 64 bits.
     """
     if messages.type_of(key) is None:
         return _pack(key, value)
@@ -314,7 +314,7 @@ class PutRequest(StreamRequest, tag="put"):
 
 
 class AskRequest(StreamRequest, tag="ask"):
-    """Sends a control request to the process that answers on a key, such as world/control or cluster/*/control."""
+    """Sends a control request to the process that answers on a key, such as world/control or cluster/NAME/control."""
 
     key: Key
     request: str
@@ -325,8 +325,9 @@ class AskRequest(StreamRequest, tag="ask"):
 class JoinRequest(StreamRequest, tag="join"):
     """Joins the lockstep: a `gate` is sent every `period_s`, and simulated time waits for the client's `done`.
 
-    `reads` are the key expressions whose messages are sent with each gate. A gate is complete once a message has
-    arrived on each key of `gates`; by default, these are the keys with a message at every gate that `reads` match.
+    `period_s` is simulated time; `reads` are the key expressions whose messages are sent with each gate. A gate is
+    complete once a message has arrived on each key of `gates`: by default, on the keys matched by `reads` that have a
+    message at every gate, or else on `clock`.
     """
 
     name: str
@@ -368,4 +369,4 @@ def decode_request(line: bytes) -> StreamRequest:
     try:
         return _decode(line)
     except REFUSALS as error:
-        raise DecodeError(f"request: {error}; must be a JSON object with op of {_OPS}") from error
+        raise DecodeError(f"request: {error}; must be a JSON object whose op is one of {_OPS}") from error

@@ -189,7 +189,7 @@ async def _read_lines(client: StreamHandler, reader: asyncio.StreamReader) -> No
 
 
 async def serve_websocket(request: web.Request, new_client: ClientFactory) -> web.WebSocketResponse:
-    """Serve a WebSocket until it ends: each text message is a line. Its request has already been authenticated."""
+    """Serve a WebSocket until it ends: each message is a line. Its request has already been authenticated."""
     websocket = web.WebSocketResponse(max_msg_size=LINE_MAX, heartbeat=HEARTBEAT_S)
     await websocket.prepare(request)
     abort = _abort_of(request)

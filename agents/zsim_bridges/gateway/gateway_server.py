@@ -1,4 +1,4 @@
-"""The gateway: serves one run after another over HTTP, WebSocket and lines of JSON, and each client on a stream."""
+"""The gateway: serves one run after another over HTTP, WebSocket and lines of JSON; and the client on each stream."""
 
 import asyncio
 import secrets
@@ -150,7 +150,7 @@ class Gateway:
         self._say(f"{self.name}: {text}")
 
     def remove(self, client: "Client") -> None:
-        """Remove a client that is gone, and release the drones that it commanded."""
+        """Remove a client that is gone, and release drones that it commanded, unless another client has its name."""
         if client not in self._clients:
             return
         self._clients.discard(client)
@@ -337,7 +337,7 @@ class Client:
         authenticated: whether the client has presented the token, or needs none.
 
     Attributes:
-        commanded: (source, drone) of the drones that the client has commanded in this run, outside a lockstep session.
+        commanded: (source, drone) of the drones that the client has commanded in this run by `put` requests.
     """
 
     def __init__(self, gateway: Gateway, outbox: Outbox, source: str, authenticated: bool, limit: RateLimit) -> None:
@@ -368,7 +368,7 @@ class Client:
             self.refuse_line(str(error), request)
         except Exception as error:  # an internal error: the gateway continues
             self._gateway.report(f"{self.source}: {line[:80]!r}: {error!r}")
-            self.refuse_line(f"the gateway failed ({type(error).__name__}); its terminal says more", request)
+            self.refuse_line(f"the gateway failed ({type(error).__name__}); its terminal shows the error", request)
 
     def send(self, answer: dict[str, Any], request: StreamRequest | None = None) -> None:
         """Put an answer into the outbox, with the id of its request."""
@@ -396,7 +396,7 @@ class Client:
 
     def _hello(self, request: client_messages.HelloRequest) -> None:
         if not self.authenticated and not self._gateway.is_token(request.token):
-            self.refuse("hello: no token, or a wrong one; the gateway's operator has it", request)
+            self.refuse("hello: no token, or a wrong one; ask the gateway's operator for it", request)
             return
         name = self._process_name(request.name) if request.name else self.source
         if not self.authenticated:
@@ -424,8 +424,8 @@ class Client:
         process = name if "." in name else f"{ROLE}.{name}"
         if not keys.PROCESS_NAME.fullmatch(process) or "." not in process.strip(".") or process == self._gateway.name:
             raise DecodeError(
-                f"name is {name[:60]!r}; must be NAME or ROLE.NAME of a-z 0-9 _ -, at most 48, e.g. myctrl or "
-                "matlab.main, and not the gateway's"
+                f"name is {name[:60]!r}; must be NAME or ROLE.NAME, at most 48 characters of a-z 0-9 _ -, "
+                "e.g. myctrl or matlab.main, and not the gateway's"
             )
         return process
 
@@ -465,7 +465,7 @@ class Client:
         if request.key not in self._subscriptions:
             if len(self._subscriptions) >= SUBSCRIPTIONS_MAX:
                 raise TooManyError(
-                    f"subscribe: has {SUBSCRIPTIONS_MAX} subscriptions already; end some, or use wildcards"
+                    f"subscribe: this client has {SUBSCRIPTIONS_MAX} subscriptions already; end some, or use wildcards"
                 )
             self._subscriptions[request.key] = self._gateway.subscriptions.subscribe(request.key, self._on_value)
         self.send({"op": "subscribe", "key": request.key}, request)
@@ -484,7 +484,9 @@ class Client:
 
     def _join(self, request: client_messages.JoinRequest) -> None:
         if self._session is not None:
-            raise DecodeError(f"join: is already {self._session.name}; leave first, or use another connection")
+            raise DecodeError(
+                f"join: this client is already {self._session.name}; leave first, or use another connection"
+            )
         name = self._process_name(request.name)
         session = LockstepSession(name, request, self._gateway.run(), self._gateway.loop, self._outbox.put)
         self._session, self.source, self._defaults = session, name, session.defaults
@@ -493,11 +495,11 @@ class Client:
 
     def _done(self, request: client_messages.DoneRequest) -> None:
         if self._session is None:
-            raise DecodeError("done: has not joined; must join first")
+            raise DecodeError("done: this client has not joined; it must join first")
         self._session.answer_gate(request)
 
     def lose_lockstep(self, successor: LockstepSession, reason: str) -> None:
-        """End the session, since another one has taken its name."""
+        """End the session if its name is now that of `successor`."""
         session = self._session
         if session is not None and session.name == successor.name and session is not successor:
             session.leave(connection_lost=True)
@@ -517,7 +519,7 @@ class Client:
 
     def _leave(self, request: client_messages.LeaveRequest) -> None:
         if self._session is None:
-            raise DecodeError("leave: has not joined; there is nothing to leave")
+            raise DecodeError("leave: this client has not joined; there is nothing to leave")
         self._session.leave()
         self._session = None
         self.send({"op": "leave"}, request)

@@ -86,8 +86,8 @@ _ERRORS = {
     400: "an invalid key or value",
     401: "no token, or a wrong one",
     403: "a reserved key, or a page of another server",
-    404: "no such drone or cluster, or no value yet",
-    405: "a method that this key does not have",
+    404: "no such drone, cluster or camera, or no value yet",
+    405: "a method that this key does not support",
     408: "a request that did not arrive completely in time",
     413: "a body that is too long",
     429: "too many requests",
@@ -169,7 +169,7 @@ class AccessCheck:
 
     @web.middleware
     async def check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse requests without the token, from other sites' pages, or above the rate limit; answer errors."""
+        """Refuse requests above the rate limit, without the token, or, if none is set, from other servers' pages."""
         response = await self._answer(request, handler)
         if not response.prepared:
             response.headers.setdefault("Access-Control-Allow-Origin", "*")
@@ -200,7 +200,7 @@ class AccessCheck:
             if isinstance(error, RuntimeError) and request.transport is None:  # raised by aiohttp for a truncated body
                 raise ConnectionResetError("the client is gone") from error
             self._report(f"{request.method} {request.path[:80]}: {error!r}")
-            return error_response(500, f"the gateway failed ({type(error).__name__}); its terminal says more")
+            return error_response(500, f"the gateway failed ({type(error).__name__}); its terminal shows the error")
 
 
 def error_response(status: int, text: str, allowed: Iterable[str] = ()) -> web.Response:
@@ -342,7 +342,7 @@ def _key_of(request: web.Request, prefix: str) -> str:
     except UnicodeDecodeError as error:
         raise DecodeError(f"path is {request.raw_path[:80]!r}; must be UTF-8, percent-encoded") from error
     if not key:
-        raise DecodeError("path is '/'; must be a key expression, e.g. /zsim/world/info")
+        raise DecodeError("path has no key expression; must have one, e.g. /zsim/world/info or /json/world/info")
     return key
 
 
@@ -377,7 +377,7 @@ def _first_accepted(request: web.Request) -> str:
 def sample_to_json(sample: RawSample) -> dict[str, Any]:
     """Return an answer or a publication in the plugin's JSON format."""
     kind, payload = sample.encoding.partition(";")[0], sample.payload
-    value: Any = base64.b64encode(payload).decode() if payload else None  # if invalid in its encoding
+    value: Any = base64.b64encode(payload).decode() if payload else None  # unless it is JSON or text by its encoding
     try:
         if payload and kind in JSON:
             value = json.loads(payload)

@@ -53,8 +53,8 @@ DELIVER_MAX = 500  # messages delivered before other tasks of the loop run
 EXPRESSIONS_MAX = 2_000  # number for all clients together; the world's session checks every subscription
 
 Subscriber = Callable[[RawSample], None]
-ANSWER_TIMEOUT_S = 10.0  # wall time after which a client that answers nothing in realtime leaves the lockstep
-LATE_PERIODS = 2  # in realtime, a gate that is this many periods late is skipped: its inputs are sent with a newer gate
+ANSWER_TIMEOUT_S = 10.0  # wall time after which, in real time, a client that does not answer a gate leaves the lockstep
+LATE_PERIODS = 2  # in real time, a gate this many periods late is skipped: its inputs are sent with a newer gate
 NO_GATE_NS = -1  # no gate waits for an answer
 _encode = msgspec.json.Encoder().encode
 
@@ -187,13 +187,13 @@ class RunAccess:
             )
 
     def check_known(self, key: str) -> None:
-        """Raise an UnknownError for a message of the contract about a drone or cluster that the run does not have."""
+        """Raise an UnknownError for a key of the contract with an unknown drone, cluster or process name."""
         kind, thing, _ = keys.parts(key.removeprefix("view/"))
         names = self._known_names.get(kind)
         if names is not None and (messages.type_of(key) or is_control_key(key)) and thing not in names:
             raise UnknownError(f"{key[:80]}: {kind} is {thing[:40]!r}; must be one of {', '.join(names) or 'none'}")
         if kind == "estimates" and not keys.PROCESS_NAME.fullmatch(thing):
-            raise UnknownError(f"{key[:80]}: process is {thing[:60]!r}; must be 1 to 48 of a-z 0-9 _ . -")
+            raise UnknownError(f"{key[:80]}: process is {thing[:60]!r}; must be 1 to 48 characters of a-z 0-9 _ . -")
 
     def camera_key(self, drone: str, camera: str) -> str:
         """Return the key of a camera's pictures, or raise an UnknownError."""
@@ -209,7 +209,7 @@ class RunAccess:
     async def request(
         self, key: str, op: str, args: dict[str, Any], source: str, timeout_s: float = 5.0
     ) -> ControlAnswer:
-        """Send a control request to the process that answers on a key; TooManyError if REQUESTS_MAX are under way."""
+        """Send a control request to the process that answers on a key; TooManyError if REQUESTS_MAX are unanswered."""
         if "*" in key:
             raise DecodeError(f"{key[:80]!r}: is not a key; a request needs one without wildcards")
         self.check_known(key)
@@ -508,12 +508,13 @@ class LockstepSession(Agent):
         send: sends the line of a gate; called on the loop.
 
     Attributes:
-        connection_lost: whether the client disconnected without leaving, so that its process counts as dead.
+        connection_lost: whether the client disconnected without leaving, or did not answer in time, so that its process
+            counts as dead.
 
     Raises:
         DecodeError: the period or a gate key is invalid.
         UnknownError: a gate key names a drone or cluster that the run does not have.
-        SessionError: an entry of `reads` is not a key expression.
+        SessionError: an entry of `reads` or `gates` is not a key expression.
     """
 
     def __init__(
@@ -579,7 +580,8 @@ class LockstepSession(Agent):
 
         Raises:
             DecodeError: there is no such gate, or an output is not a message of its key.
-            ForbiddenError: an output's key is reserved.
+            ForbiddenError: an output's key is reserved, or access control does not permit it.
+            UnknownError, SessionError: see `RunAccess.encode`.
         """
         if self._gate_ns == NO_GATE_NS:
             raise DecodeError("done: there is no gate to answer; wait for the next")

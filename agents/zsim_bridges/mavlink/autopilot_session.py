@@ -53,17 +53,11 @@ CLIMBED_FRACTION = 0.85  # fraction of the take-off height that counts as reache
 REPEAT_NS = 1_000_000_000  # period of repeated commands; ample, since an autopilot answers within about 0.1 s
 KILL_REPEAT_NS = 200_000_000  # shorter than REPEAT_NS, since this is the one command that must not be lost
 SETPOINT_NS = 40_000_000  # 25 Hz; PX4 treats setpoints at less than 2 Hz as lost
-CHANGE_INTERVAL_NS = 15_000_000  # minimum spacing of changed setpoints; below the gate period (one command each)
+CHANGE_INTERVAL_NS = 15_000_000  # minimum spacing of changed setpoints; below the gate period (one setpoint each)
 STREAM_DURATION_NS = 600_000_000  # PX4 requires more than 0.5 s of setpoints before OFFBOARD
 VELOCITY_AND_YAW_RATE = 0xFFF & ~(TypeMask.VX | TypeMask.VY | TypeMask.VZ | TypeMask.FORCE | TypeMask.YAW_RATE)
-NO_POSITION = (
-    0.0,
-    0.0,
-    0.0,
-    math.nan,
-    math.nan,
-    math.nan,
-)  # first six parameters of NAV_LAND and NAV_TAKEOFF: no position given
+# First six parameters of NAV_LAND and NAV_TAKEOFF: no position given
+NO_POSITION = (0.0, 0.0, 0.0, math.nan, math.nan, math.nan)
 _RATES_HZ: dict[type, float] = {
     dialect.AttitudeQuaternion: 50,
     dialect.LocalPositionNed: 50,
@@ -346,8 +340,8 @@ class AutopilotState:
 class DemandSequence:
     """The commands and setpoints that make one autopilot carry out demands.
 
-    Commands are repeated until the telemetry shows their effect; setpoints are sent at once when they change, and
-    repeated while they do not.
+    Commands are repeated until the telemetry shows their effect, a kill as long as it is demanded; setpoints are sent
+    when they change, at most every CHANGE_INTERVAL_NS, and repeated while they do not.
     """
 
     def __init__(self, takeoff_height_m: float) -> None:

@@ -125,7 +125,7 @@ LandedState = IntEnum("LandedState", "UNDEFINED ON_GROUND IN_AIR TAKEOFF LANDING
 
 
 class SensorBit(IntFlag):
-    """MAV_SYS_STATUS_SENSOR: the sensors and subsystems of the vehicles presented here."""
+    """MAV_SYS_STATUS_SENSOR: the sensors and subsystems of the vehicles that this bridge presents."""
 
     GYRO = 0x01
     ACCEL = 0x02
@@ -162,7 +162,7 @@ class Capability(IntFlag):
 
 
 TypeMask = IntFlag("TypeMask", "X Y Z VX VY VZ AX AY AZ FORCE YAW YAW_RATE")
-"""POSITION_TARGET_TYPEMASK: the parts of a setpoint to be ignored."""
+"""POSITION_TARGET_TYPEMASK: the parts of a setpoint to be ignored; FORCE: the acceleration is a force."""
 
 
 class AttitudeMask(IntFlag):
@@ -212,7 +212,7 @@ _PARAMS = "param1,param2,param3,param4:f"
 _ITEM = f"{_TARGET} seq:H frame:B command:H current,autocontinue:B {_PARAMS}"
 
 _TABLE = f"""
-# A system and its link: life, time, versions, texts, files, signing
+# A system and its link: heartbeat, time, versions, texts, files, signing
 0 HEARTBEAT type,autopilot,base_mode:B custom_mode:I system_status,mavlink_version:B
 1 SYS_STATUS onboard_control_sensors_present,onboard_control_sensors_enabled,onboard_control_sensors_health:I
     load:H[d%] voltage_battery:H[mV] current_battery:h[cA] battery_remaining:b[%] drop_rate_comm:H[c%]
@@ -253,7 +253,7 @@ _TABLE = f"""
 244 MESSAGE_INTERVAL message_id:H interval_us:i[us]
 345 PARAM_ERROR {_TARGET} param_id:16c param_index:h error:B
 
-# Missions, geofences and rally points; x and y of an item are 1e-7 deg as whole numbers, 1e-4 m in local frames
+# Missions, geofences and rally points; x and y of an integer item are in 1e-7 deg, in local frames in 1e-4 m
 37 MISSION_REQUEST_PARTIAL_LIST {_TARGET} start_index,end_index:h | mission_type:B
 38 MISSION_WRITE_PARTIAL_LIST {_TARGET} start_index,end_index:h | mission_type:B
 39 MISSION_ITEM {_ITEM} x,y,z:f | mission_type:B
@@ -280,7 +280,7 @@ _TABLE = f"""
 144 FOLLOW_TARGET timestamp:Q[ms] est_capabilities:B lat,lon:i[degE7] alt:f[m] vel:3f[m/s] acc:3f[m/s/s] attitude_q:4f
     rates:3f position_cov:3f custom_state:Q
 
-# Places: origin, home, targets, fence, poses from outside
+# Places: origin, home, targets, fence, external pose measurements
 48 SET_GPS_GLOBAL_ORIGIN target_system:B {_GEODETIC} | time_usec:Q[us]
 49 GPS_GLOBAL_ORIGIN {_GEODETIC} | time_usec:Q[us]
 62 NAV_CONTROLLER_OUTPUT nav_roll,nav_pitch:f[deg] nav_bearing,target_bearing:h[deg] wp_dist:H[m] alt_error:f[m]
@@ -361,7 +361,7 @@ class WireMessage(msgspec.Struct, gc=False):
 
 
 class MessageLayout(WireLayout):
-    """The payload layout of one message type: larger fields first, then the extensions in their order of definition.
+    """The payload layout of one message type: fields with the largest elements first, then extensions as defined.
 
     Attributes:
         crc_extra: checksum of the definition, so that peers with different definitions reject each other's messages.

@@ -48,9 +48,9 @@ REASONS = {
     "truncated": "a truncated frame",
     "unsigned": "a frame without a signature",
     "bad_signature": "a frame with a wrong signature",
-    "replayed": "a signed frame that was sent before",
+    "replayed": "a signed frame whose timestamp is too old",
     "noise": "bytes outside frames",
-    "unsent": "a message of its own whose values do not fit into their fields",
+    "unsent": "a message of its own that cannot be encoded",
     "stranger": "a datagram that is not from the configured peer",
 }
 Address = tuple[str, int]
@@ -64,7 +64,7 @@ class MavlinkOptions(NamedTuple):
         gcs, gcs_local: address of the ground station, and the first drone's local port for it.
         api, api_local: address of programs for the first drone, and its local port for them; later drones count up.
         key: signing key; None for no signatures.
-        rate: pace to request from a run that would go as fast as possible; None to request none.
+        rate: pace to request from the world; None to request none.
         first_system_id: system id of the first drone; the others count up.
     """
 
@@ -209,7 +209,7 @@ class ServedVehicle:
         self.send(self.vehicle.take())
 
     def send(self, messages: Sequence[WireMessage]) -> None:
-        """Send messages to all peers, several per datagram; messages with values out of range are only counted."""
+        """Send messages to all peers, several per datagram; messages that cannot be encoded are only counted."""
         datagrams: list[bytes] = []
         for message in messages:
             try:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract.messages import Origin
 from zsim.contract.run_messages import Event
-from zsim.errors import without_figures
+from zsim.errors import without_numbers
 from zsim.math import elementary as el
 from zsim.math.frames import turned_about_up
 from zsim.math.rotation import Vector
@@ -248,7 +248,7 @@ class MavlinkVehicle:
         match request.command:
             case Cmd.COMPONENT_ARM_DISARM:
                 if first not in (0.0, 1.0):
-                    return f"arm or disarm? {first:g}"
+                    return f"param1 is {first:g}; must be 0 or 1"
                 arm = flight.arm if first else flight.disarm
                 return arm(second == dialect.FORCE)
             case Cmd.NAV_TAKEOFF:
@@ -276,7 +276,7 @@ class MavlinkVehicle:
             case Cmd.DO_SET_HOME:
                 position = state.position_m if first == 1.0 else _requested_position(state, request)
                 if position is None:
-                    return "no place for home"
+                    return "no valid position for home"
                 state.home_m = position
                 return self._send_message(HOME_POSITION)
             case Cmd.DO_FLIGHTTERMINATION:
@@ -325,7 +325,7 @@ class MavlinkVehicle:
         speed_m_s, _, _, yaw = request.params[:4]
         position = _requested_position(self.state, request)
         if position is None:
-            return "no place to go to"
+            return "no valid target position"
         yaw_rad = yaw_ned(yaw) if math.isfinite(yaw) else None
         speed = speed_m_s if math.isfinite(speed_m_s) and speed_m_s > 0 else None
         return self.flight.go_to(Target(position, yaw_rad=yaw_rad, speed_m_s=speed))
@@ -354,8 +354,8 @@ class MavlinkVehicle:
 
     def _set_point(self, setpoint: Setpoint | str) -> None:
         reason = setpoint if isinstance(setpoint, str) else self.flight.set_point(setpoint)
-        if reason and without_figures(reason) not in self._refused and len(self._refused) < REFUSED_MAX:
-            self._refused.add(without_figures(reason))  # a stream of refusals would flood the operator's screen
+        if reason and without_numbers(reason) not in self._refused and len(self._refused) < REFUSED_MAX:
+            self._refused.add(without_numbers(reason))  # a stream of refusals would flood the operator's screen
             self._deny(reason)
 
     def _steer(self, message: dialect.ManualControl) -> None:
@@ -378,7 +378,7 @@ class MavlinkVehicle:
     def _go_to(self, message: dialect.MissionItem | dialect.MissionItemInt, sender: Address) -> None:
         item = item_of(message)
         fault = item_fault(item, dialect.MISSION)
-        reason = "no place to go to" if fault else self.flight.go_to(Target(position_of(item, self.state)))
+        reason = "no valid target position" if fault else self.flight.go_to(Target(position_of(item, self.state)))
         self._deny(reason)
         self._send(dialect.MissionAck(*sender, type=fault or (1 if reason else 0)))
 
@@ -460,7 +460,7 @@ def _target(
     velocity = (message.vx, message.vy, message.vz)
     given_axes = [not mask & bit and math.isfinite(v) for v, bit in zip(velocity, bits, strict=True)]
     if position == NO_POSITION and not any(given_axes):
-        return "a setpoint has neither position nor velocity"
+        return "no position or velocity in a setpoint"
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
     if any(given_axes):
         vx, vy, vz = (v if is_axis_given else 0.0 for v, is_axis_given in zip(velocity, given_axes, strict=True))
@@ -492,7 +492,7 @@ def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoi
         return "body rates need an attitude too"
     length = el.length(message.q)
     if not all(map(math.isfinite, values)) or not 0.5 < length < 2.0:
-        return "the attitude of a setpoint is not a quaternion"
+        return "invalid attitude, thrust or yaw rate"
     w, x, y, z = dialect.attitude_ned((message.q[0], message.q[1], message.q[2], message.q[3]))
     q_WB = w / length, x / length, y / length, z / length
     thrust = HOVER_THRUST if mask & AttitudeMask.THRUST else max(0.0, min(1.0, message.thrust))

@@ -81,7 +81,7 @@ class MissionStep(NamedTuple):
 
 
 def position_of(item: PlanItem, state: VehicleState) -> Vector:
-    """Return the position of an item in W [m]; the vehicle's x or y replaces one that is not given."""
+    """Return an item's position in W [m]; x or y not given is the vehicle's, z not given is 0 in the item's frame."""
     current_x, current_y, _ = state.position_m
     z = item.z if math.isfinite(item.z) else 0.0
     if item.frame in LOCAL:

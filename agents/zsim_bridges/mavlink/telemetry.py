@@ -1,7 +1,7 @@
 """The telemetry of a vehicle: its messages, each built from the state at one gate, and their rates.
 
 A builder returns None if there is nothing to send or its sensor has failed. Messages that are due at the same gate are
-sent in the order of TELEMETRY_ROWS.
+sent in the order of TELEMETRY_ROWS, followed by those that a client has switched on.
 """
 
 import math
@@ -280,7 +280,7 @@ def altitude(s: TelemetrySource) -> WireMessage:
 
 
 def _estimator_flags(s: TelemetrySource) -> int:
-    """Return the estimator's flags: all, but without those of the absolute position if the GPS has failed."""
+    """Return the estimator's flags: all, without the absolute position if it is estimated and the GPS has failed."""
     if s.state.is_estimated and s.state.has_failed("gps"):
         return dialect.ALL_ESTIMATED & ~(dialect.POS_HORIZ_ABS | dialect.PRED_POS_HORIZ_ABS)
     return dialect.ALL_ESTIMATED
@@ -439,13 +439,16 @@ class Telemetry:
         return messages
 
     def build(self, message_id: int) -> WireMessage | None:
-        """Return the current message; None if this vehicle does not send it."""
+        """Return the current message; None if there is none, or this vehicle does not send it."""
         kind = MESSAGE_TYPES_BY_ID.get(message_id)
         self._source.advance()
         return TELEMETRY_ROWS[kind].build(self._source) if kind else None
 
     def set_interval(self, message_id: int, interval_us: float) -> bool:
-        """Set the interval of a message (-1: never, 0: the default); return False if this vehicle does not send it."""
+        """Set the interval of a message (-1: never, 0: the default); return False if this vehicle does not send it.
+
+        The interval of the heartbeat is fixed.
+        """
         kind = MESSAGE_TYPES_BY_ID.get(message_id)
         if kind is None:
             return False

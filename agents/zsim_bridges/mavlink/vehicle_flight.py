@@ -136,7 +136,7 @@ class Flight:
         if reason and (self._state.is_airborne or self.foreign_commander):
             return reason
         if self._state.state == "landing" and mode is not FlightMode.LAND:
-            return "landing; the mode can be changed only after touchdown"
+            return "landing; no mode change before touchdown"
         return self._enter(mode)
 
     def go_to(self, target: Target) -> str | None:

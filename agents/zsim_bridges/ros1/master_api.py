@@ -48,7 +48,7 @@ def call_api(uri: str, method: str, *arguments: Any) -> Any:
     with xmlrpc.client.ServerProxy(uri, transport=_Transport()) as proxy:
         answer: Any = getattr(proxy, method)(*arguments)
     if not isinstance(answer, list) or len(answer) != 3:
-        raise ApiError(f"{uri}: {method} answers no [code, text, value]")
+        raise ApiError(f"{uri}: the answer to {method} is not [code, text, value]")
     code, text, value = answer
     if code != SUCCESS:
         raise ApiError(f"{uri}: {method}: {text}")
@@ -90,7 +90,7 @@ def own_address(master_uri: str, environment: Mapping[str, str] = os.environ) ->
     ROS's environment variables take precedence over the address from which this host reaches the master.
 
     Raises:
-        RunError: the URI is invalid, or its host is unknown.
+        RunError: the URI is invalid, its host is unknown, or there is no route to it.
     """
     try:
         parts = urlsplit(master_uri)
@@ -124,7 +124,7 @@ class GraphEntry(NamedTuple):
 
 
 class Registration:
-    """Keeps a node registered from construction until `close`, in a separate thread.
+    """Keeps a node registered from construction until `close`, or until it is displaced, in a separate thread.
 
     Args:
         on_publishers: called with each subscribed topic and its publishers, whenever the node has registered.

@@ -40,14 +40,14 @@ Say = Callable[[str], None]
 
 
 class Ros1Node:
-    """One node; everything but its slave API runs in one asyncio loop.
+    """One node; everything but its slave API and its registration runs in one asyncio loop.
 
     Args:
         name: name in the ROS graph, such as "/zsim".
         host: name or address at which other nodes reach this host.
 
     Attributes:
-        shutdown_reason: who asked this node to stop, and why; empty until then.
+        shutdown_reason: why this node must stop; empty until then.
     """
 
     def __init__(self, name: str, master_uri: str, host: str, say: Say) -> None:
@@ -308,7 +308,7 @@ class RefusedError(ValueError):
 
 
 class SubscribedTopic:
-    """A topic that the node subscribes to, with a connection to each publisher, re-established when it breaks.
+    """A topic that the node subscribes to, with a connection to each publisher, renewed unless it is refused.
 
     Attributes:
         connected: names of connected publishers by the URI of their slave API.
@@ -482,7 +482,7 @@ async def read_header(reader: StreamReader) -> dict[str, str]:
 
     Raises:
         ValueError: the header is malformed.
-        TimeoutError: it does not arrive within HANDSHAKE_S.
+        TimeoutError: it does not arrive within HANDSHAKE_TIMEOUT_S.
     """
     return decode_header(await asyncio.wait_for(read_frame(reader, HEADER_MAX), HANDSHAKE_TIMEOUT_S))
 

@@ -54,7 +54,7 @@ Navdata = message_class("ardrone_autonomy/Navdata")
 
 
 class NodeShutdownError(RunError):
-    """A ROS node, or the master, has asked this node to stop."""
+    """A ROS node or the master has asked this node to stop, or another node has taken its name."""
 
 
 def serve(
@@ -73,7 +73,7 @@ def serve(
         host: name or address at which ROS nodes reach this host.
 
     Raises:
-        NodeShutdownError: ROS asked this node to stop.
+        NodeShutdownError: ROS asked this node to stop, or another node took its name.
         RunError: two drones have the same name in ROS.
     """
     drone_link.warm_up()
@@ -143,7 +143,7 @@ class Ros1Bridge(PictureServer):
                     self.refuse(f"{key}: {error}")
 
     def on_event(self, event: Event) -> None:
-        """Print each command from a ROS node that the world refuses."""
+        """Print why the world refuses commands from ROS nodes, each reason once."""
         if (event.kind, event.source) == ("refused", self.observer.name):
             self.say_once(f"{event.subject}: {event.data.get('reason', event.text)}")
 
@@ -234,7 +234,7 @@ class DriverCommands:
         self._status: flight_messages.Status | None = None
 
     def on_cmd_vel(self, twist: Any) -> None:
-        """Follow a geometry_msgs/Twist from the next gate on.
+        """Follow a geometry_msgs/Twist from the next gate on, if the drone is in the air.
 
         Raises:
             ValueError: a component is not finite.

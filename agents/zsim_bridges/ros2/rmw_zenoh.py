@@ -134,7 +134,7 @@ def gid_of(token: str) -> bytes:
 
 
 class Attachment(NamedTuple):
-    """The attachment of every message, request and reply: sequence number (from 1), wall time [ns], and sender."""
+    """The attachment of a message, request or reply: sequence number (from 1), wall time [ns], sender (client) gid."""
 
     sequence: int
     wall_ns: int
@@ -151,7 +151,7 @@ def attachment_of(data: bytes) -> Attachment:
         ValueError: the data are not an attachment of rmw_zenoh.
     """
     if len(data) != ATTACHMENT_BYTES or data[_ATTACHMENT_HEADER.size - 1] != GID_BYTES:
-        raise ValueError(f"the attachment has {len(data)} bytes; must have {ATTACHMENT_BYTES}, of rmw_zenoh >= 0.2.4")
+        raise ValueError(f"the attachment has {len(data)} bytes; must have {ATTACHMENT_BYTES} (rmw_zenoh >= 0.2.4)")
     sequence, wall_ns, _ = _ATTACHMENT_HEADER.unpack_from(data)
     return Attachment(sequence, wall_ns, data[_ATTACHMENT_HEADER.size :])
 
@@ -259,7 +259,7 @@ class Publisher:
         """Send a message without ever waiting; a subscriber that is too slow loses it.
 
         Raises:
-            ValueError: the message does not fit its type.
+            ValueError, OverflowError, struct.error: the message does not fit its type.
         """
         payload = encode(message, self._kind)
         self._sent += 1

@@ -86,7 +86,7 @@ def serve(
                     bridge.report_once("router", waiting_text)
             if ros_link is not None and not is_advertised:
                 bridge.advertise_run(RosContext(ros_link, network.domain, wall_ns, bridge.count_refused))
-                say(f"{observer.name}: ROS domain {network.domain} by {network.router or 'the hub of the world'}")
+                say(f"{observer.name}: ROS domain {network.domain} via {network.router or 'the hub of the world'}")
                 is_advertised = True
             bridge.process(POLL_S)
 
@@ -186,7 +186,7 @@ class Ros2Bridge:
         )
         for original, name in {**names, **self.names.clusters}.items():
             if original != name:
-                self.report_once(original, f"{original} is called {name} in ROS, which does not allow this name")
+                self.report_once(original, f"{original} is called {name} in ROS, which does not allow the original")
 
     def _advertise(self, node: Ros2Node, run_topics: Iterator[Topic]) -> None:
         for topic in run_topics:
@@ -200,7 +200,7 @@ class Ros2Bridge:
             return
         if rmw_zenoh.data_key(self._domain, *endpoint[1:]) != publication.publisher.key:
             kind = publication.topic.kind
-            self.report_once(token, f"{endpoint.name}: a subscriber expects {endpoint.type_name}; it is {kind}")
+            self.report_once(token, f"{endpoint.name}: a subscriber expects {endpoint.type_name}; the type is {kind}")
             return
         readers, had_readers = publication.readers, bool(publication.readers)
         readers.add(token) if is_alive else readers.discard(token)

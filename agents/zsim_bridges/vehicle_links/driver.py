@@ -88,7 +88,7 @@ def drive(
     """Run the driver of one aircraft until the run is over, or `stopped` returns True.
 
     Raises:
-        RunError: the drone is not external, or the run does not follow the wall clock.
+        RunError: the drone is not external, this process has another name, or the run does not follow the wall clock.
     """
     check_run(info, observer.name, options.drone)
     session = make_session(info, scenario_file.from_text(info.scenario), options)
@@ -204,7 +204,7 @@ class DriverProcess:
             case op:
                 error = f"op is {op[:40]!r}; must be one of arm, disarm, kill"
         query.answer(ControlAnswer(error is None, error or ""))
-        self._say(f"{source} asks {request.op}: {error or 'done'}")
+        self._say(f"{source} requests {request.op}: {error or 'done'}")
         self._send()
         self._report(now_ns)
 
@@ -228,8 +228,8 @@ class DriverProcess:
         if self._session.state.received_ns is None:
             channel, refused_count = self._session.channels[0], self._session.link_quality().refused
             silence = self._sockets[0].fault.lower() or "nothing arrives"
-            cause = f"{refused_count} messages from other senders arrived" if refused_count else silence
-            advice = "check its address, that it is switched on, and over MAVLink its system id and key"
+            cause = f"{refused_count} messages arrived, but were not accepted" if refused_count else silence
+            advice = "check its address, that it is switched on, and, over MAVLink, its system id and key"
             self._say(f"no aircraft at {channel.host}:{channel.port} ({cause}); {advice}")
 
     def _send(self) -> None:
@@ -280,13 +280,13 @@ class DriverProcess:
         self._failsafe.land(reason, self._clock.now_ns())
         deadline_s = time.monotonic() + LANDING_S
         if self._failsafe.phase == "landing":
-            self._say(f"{reason}; it lands; a second Ctrl-C exits without waiting")
+            self._say(f"{reason}; the aircraft lands; a second Ctrl-C exits without waiting")
         while (is_stopping := self._failsafe.is_stopping(self._session.state)) and time.monotonic() < deadline_s:
             self._tick()
             await asyncio.sleep(TICK_S)
         if is_stopping:
             state = self._session.state.state
-            self._say(f"it is still {state} after {LANDING_S:g} s; take it over by hand")
+            self._say(f"the aircraft is still {state} after {LANDING_S:g} s; take control by hand")
 
 
 class DriverClock:

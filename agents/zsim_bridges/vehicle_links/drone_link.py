@@ -15,9 +15,7 @@ from zsim.sensors.sensor import Mount
 from zsim_agents.estimation.strapdown import madgwick_step
 
 BETA_RAD_S = 0.02  # gain of Madgwick's filter, which levels within seconds and is hardly disturbed by manoeuvres
-REPEAT_NS = (
-    100_000_000  # ns; repetition period of setpoints: a commander silent for 0.5 s counts as lost (`silence.hover_s`)
-)
+REPEAT_NS = 100_000_000  # repetition period of setpoints: a commander silent for 0.5 s is lost (`silence.hover_s`)
 STEP_S_MAX = 0.1  # s; the filter does not integrate over longer gaps between IMU samples
 POSITIONS_MAX = 32  # gates for which the integrated position is remembered; an estimate is at most a few gates late
 ModeName = Literal["takeoff", "land", "emergency", "reset"]

@@ -12,7 +12,7 @@ from zsim.contract import keys, messages
 from zsim.contract.framing import run_key_table
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
-from zsim.errors import DecodeError, NoWorldError, RunError, SessionError, without_figures
+from zsim.errors import DecodeError, NoWorldError, RunError, SessionError, without_numbers
 from zsim.runtime.membership import HealthMeter
 from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, ReceivedSample, Session, Unanswered
@@ -133,6 +133,7 @@ class VehicleServer(ABC):
 
         Raises:
             RunError: the run has no pace, or a port or an address is unavailable.
+            NoWorldError: the world does not answer, usually because it has ended.
         """
         set_pace(link, info, observer.name, options.rate)
         asyncio.run(cls(link, info, observer, say, options).run(stopped))
@@ -186,7 +187,7 @@ class VehicleServer(ABC):
 
     def say_once(self, text: str) -> None:
         """Print a text once; texts that differ only in numbers count as equal."""
-        reason = without_figures(text)
+        reason = without_numbers(text)
         if reason not in self._reported and len(self._reported) < REPORTED_MAX:
             self._reported.add(reason)
             self.say(text)

@@ -29,7 +29,7 @@ from zsim.math.frames import geodetic_to_enu, heading, turned_about_up
 from zsim.math.rotation import LEVEL, Quaternion, Vector
 from zsim.scenario.scenario import Silence
 
-WINDOW_NS = 5_000_000_000  # design choice: long against queuing, short against clock drift (50 ppm: 0.25 ms)
+WINDOW_NS = 5_000_000_000  # design choice: much longer than queuing, yet with little clock drift (50 ppm: 0.25 ms)
 SIGMA_UNKNOWN_M = 2.0  # m, for a GPS receiver that does not report its accuracy (paper, section VI)
 P0_PA = 101_325.0  # Pa, pressure at sea level (ISO 2533)
 SCALE_M = 44_330.77  # m, T0 / lapse rate = 288.15 K / 6.5 K/km (ISO 2533)
@@ -44,7 +44,7 @@ RESET_S = 2.0  # time limit of a reset: ten times what an AR.Drone needs to leav
 LINK_LOST_S = 1.0  # silence that means a lost link: telemetry comes ten times a second, heartbeats once
 BRAKING_M_S2 = 1.0  # half the acceleration of an AR.Drone at 12 deg of tilt; limits the speed towards the fence
 RETURN_M_S = 0.5  # speed of the return into the fence; slow, since nobody commanded it
-BREACH_MARGIN_M = 1.0  # distance outside the fence at which the aircraft lands; positive, since it should stop at it
+BREACH_MARGIN_M = 1.0  # distance outside the fence at which the aircraft lands; > 0, since it should stop at the fence
 Phase = Literal["idle", "taking_off", "airborne", "landing", "killed", "resetting"]
 
 
@@ -128,7 +128,7 @@ class Failsafe:
 
     Attributes:
         armed: whether commands are obeyed.
-        commander: source of the last setpoint.
+        commander: source of the last setpoint; None once the world or a landing has ended its control.
         reason: why the aircraft last left the commander's control; empty for never.
     """
 
@@ -158,7 +158,7 @@ class Failsafe:
     def disarm(self, vehicle: AircraftState) -> str | None:
         """Stop obeying commands; return None, or the reason for a refusal."""
         if vehicle.state not in MOTORS_OFF_STATES:
-            return f"the aircraft is {vehicle.state}; land first, or kill"
+            return f"the aircraft is {vehicle.state}; land it first, or kill it"
         self.armed, self.phase = False, "idle"
         return None
 
@@ -209,7 +209,7 @@ class Failsafe:
 
     def _take_off(self, now_ns: int, vehicle: AircraftState) -> str | None:
         if vehicle.state != "landed":
-            return f"the aircraft is {vehicle.state}; a take-off needs it landed"
+            return f"the aircraft is {vehicle.state}; it must be landed to take off"
         if self._is_outside(vehicle):
             return "the aircraft stands outside the fence; carry it inside, or start the driver with another fence"
         self._setpoint = self.commander = None
@@ -245,7 +245,7 @@ class Failsafe:
                 return Demand("none")
 
     def _advance_phase(self, now_ns: int, vehicle: AircraftState) -> None:
-        """Enter the next phase once the aircraft has reached it, or because of a silence."""
+        """Enter the phase that the aircraft has reached, or that a silence, a time limit or the fence requires."""
         is_airborne = vehicle.state in AIRBORNE
         has_had_time = now_ns - self._entered_ns > LINK_LOST_S * 1e9  # for the telemetry to show that it obeys
         if self.phase in ("taking_off", "airborne") and vehicle.state == "emergency":
@@ -269,7 +269,7 @@ class Failsafe:
         elif self.phase == "airborne" and self._setpoint is not None and now_ns - self._setpoint_ns > self._land_ns:
             self.land(f"{self.commander} is silent", now_ns)
         elif self.phase in ("taking_off", "airborne") and self._is_outside(vehicle):
-            self.land("it is outside the fence", now_ns)
+            self.land("the aircraft is outside the fence", now_ns)
         elif (
             self.phase in ("taking_off", "airborne") and now_ns - max(self._clock_ns, self._entered_ns) > self._land_ns
         ):
@@ -427,7 +427,7 @@ class AircraftReadings:
         return readings
 
     def read(self, sensor: str, taken_ns: int, *values: Any) -> bool:
-        """Add a reading if it differs from the last one, since aircraft repeat the last values of slow sensors."""
+        """Add a reading if it is finite and new (aircraft repeat those of slow sensors); return whether it is."""
         if self._last.get(sensor) == values or not _is_finite(values):
             return False
         self._last[sensor] = values

@@ -1,9 +1,9 @@
-"""Parts shared by the web servers of console and gateway: event loop thread, listening, access, bounded connections.
+"""Parts shared by the console's and gateway's web servers: event loop thread, listening, access, bounded connections.
 
 aiohttp waits indefinitely for the end of a request, and keeps the part of its body that has arrived; a thousand
 connections with unfinished requests would take a gigabyte, and all file descriptors of the process. A connection is a
-stranger until one of its requests has been answered without an error, except while a request is being answered;
-strangers never displace others.
+stranger until one of its requests has been answered without an error, except while a request is being answered. A new
+connection for which there is no room displaces a stranger, or else an idle connection.
 """
 
 import asyncio
@@ -195,7 +195,7 @@ class HttpConnections:
                 await request.read()
         except TimeoutError:
             connection.is_known = False  # its next request has a stranger's time limit
-            raise web.HTTPRequestTimeout(text=f"a request must be whole within {self._request_s:g} s") from None
+            raise web.HTTPRequestTimeout(text=f"a request must arrive in full within {self._request_s:g} s") from None
 
     @asynccontextmanager
     async def _reserve_body(self, size: int) -> AsyncIterator[None]:

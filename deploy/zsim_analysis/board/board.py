@@ -1,4 +1,4 @@
-"""Flies a board (every law in every scenario with every seed, on all cores) and makes its tables of means.
+"""Flies a board (every law in every scenario with every seed) and makes its tables of means.
 
 The folder of a board:
 
@@ -10,7 +10,7 @@ The folder of a board:
 
 A law is `cluster_space`, the stock controller with a template; one of `zsim.scenario.scenario.LAWS`; or a user's
 subclass of `zsim_agents.laws.pilot.Pilot`, `package.module:Class`. All fly the same drones from the same positions with
-the same sensors, wind and seeds; each law has its default parameters.
+the same sensors, wind and seeds; a law has its default parameters, except for the times and places of the plan.
 """
 
 import copy
@@ -31,7 +31,7 @@ from rich.console import Console
 
 from zsim import __version__
 from zsim.errors import ReportError, ScenarioError
-from zsim.output_folder import held_folder
+from zsim.output_folder import locked_folder
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import LAWS, Scenario
 from zsim_agents.hosting import check_classes
@@ -45,7 +45,7 @@ from zsim_analysis.sweep.sweep_run import Row, Task
 JOURNAL, CSV, MARKDOWN = "journal.jsonl", "board.csv", "board.md"
 OWN_FILES = (JOURNAL, CSV, MARKDOWN, "summary.json", "report.html", "figures", ".lock")
 TRACK_S = 0.5  # interval between the samples of a flight that are kept for the figures
-DECIMALS = 3  # decimals kept of times, positions and errors: to the millimetre
+DECIMALS = 3  # decimals kept of times, positions and errors: to the millisecond or millimetre
 CLUSTER_SPACE = "cluster_space"
 LAW_NAMES = (CLUSTER_SPACE, *LAWS)
 PILOT, CONTROLLER = "pilot", "main"
@@ -115,11 +115,11 @@ def fly_board(request: BoardRequest) -> list[Row]:
 
     Raises:
         ScenarioError: a law cannot be flown; one line per fault.
-        RunError: the folder holds something else or cannot be written, or workers cannot start.
+        RunError: the folder holds something else, is in use or cannot be written, or workers cannot start.
         KeyboardInterrupt: the finished flights are in the journal.
     """
     tasks = _tasks(request)
-    with held_folder(request.out, JOURNAL, OWN_FILES, request.force, "write a board into", "another board is flown"):
+    with locked_folder(request.out, JOURNAL, OWN_FILES, request.force, "write a board into", "another board runs"):
         rows_by_identity = {row["identity"]: row for row in read_journal(request.out / JOURNAL)}
         missing = [task for task in tasks if task.varied["identity"] not in rows_by_identity]
         with SweepScreen(len(tasks), len(tasks) - len(missing), request.console) as screen:
@@ -246,10 +246,10 @@ def about(scenario: str) -> str:
 
 
 def select_names(given: str | None, known: Sequence[str], option: str, open_to_classes: bool = False) -> list[str]:
-    """Return the names of a comma-separated list without repetitions; for None, all known names.
+    """Return the names of a comma-separated list without repetitions; all known names if it is None or empty.
 
     Raises:
-        ScenarioError: the list is empty or has unknown names; one line per name.
+        ScenarioError: the list contains only commas, or unknown names; one line per name.
     """
     names = [*dict.fromkeys(name.strip() for name in given.split(",") if name.strip())] if given else [*known]
     allowed = f"must be one of {', '.join(known)}{', or package.module:Class' if open_to_classes else ''}"

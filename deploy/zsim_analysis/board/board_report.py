@@ -112,7 +112,7 @@ def _measures(board: Board) -> style.ReportFigure:
     style.letter_panels(list(panels.flat[: len(shown)]))
     style.legend_above(figure, panels[0, 0])
     spread = f"Means over {board.seeds} seeds; lines from the minimum to the maximum."
-    caption = f"{spread} A law without a mark has no such measure."
+    caption = f"{spread} No mark: the law has no such measure, or all its flights failed."
     return style.ReportFigure("measures.png", "What the laws achieve", caption, figure)
 
 
@@ -185,7 +185,8 @@ def _shapes(board: Board, first_seed_rows: dict[tuple[str, str], Row]) -> style.
     style.legend_above(figure, panels[0, 0])
     descriptions = "; ".join(f"{each.replace('_', ' ')}: {about(each)}" for each in board.scenarios)
     caption = (
-        "Root mean square distance of the drones from their positions, after the best fit that the law leaves open; "
+        "Root mean square distance of the drones from their desired positions, after the best fit of what the law "
+        "leaves open; "
         f"laws without desired positions are not shown. {descriptions[0].upper()}{descriptions[1:]}."
     )
     return style.ReportFigure("shapes.png", "Shape error over time, first seed", caption, figure)

@@ -1,12 +1,13 @@
-"""Measures, shared by all laws, of how well a formation was flown, from the true motion within the report's window.
+"""Measures, shared by all laws, of how well a formation was flown: errors and separation from the true motion within
+the report's window; effort, messages and CPU time over the whole flight.
 
 `measures` is a function for `report.metrics`, so that sweeps over a law's parameters can have them too:
 
     zsim sweep scenario.yaml --vary agents.pilot.parameters.gain_1_s=0.2,0.4 \
         --set report.metrics=zsim_analysis.board.measures:measures
 
-Only drones in the air are measured: if a formation has lost one, the measures are those of the others. The reference is
-always the plan's, even while drones are held.
+Errors and separation are those of the drones in the air: if a formation has lost one, those of the others. The
+reference is always the plan's, even while drones are held.
 """
 
 from dataclasses import replace
@@ -54,9 +55,10 @@ def measures(flight: RecordedFlight, figure: Figure | None = None) -> dict[str, 
 
     shape_error_m: RMS distance of the drones from the figure's positions, after the best translation, rotation and
         scaling that the law leaves open; for a lattice, RMS deviation of its sides from the spacing.
-    place_error_m: the same distance without any fit. None for flocks, which have no desired positions.
+    place_error_m: the same distance without any fit; None for flocks, which have no desired positions.
     centre_error_m: RMS distance of the drones' centre from the desired one.
-    effort_m2_s: integral of the squared horizontal velocity command over the whole flight, mean over the drones.
+    effort_m2_s: integral of the squared horizontal velocity command over the whole flight, mean over the drones with
+        such commands.
     separation_m: minimum distance between two drones in the air.
     messages_per_drone_s: messages to others, per drone and simulated second: those of the pilots, or the estimates
         that a controller reads and the commands that it sends.
@@ -132,7 +134,7 @@ def shape_errors(formation: FormationTrack) -> Array:
 
 
 def lattice_errors(p: Array, spacing_m: float, reach_m: float) -> Array:
-    """Return the root mean square deviation from the spacing of all sides below `reach_m`, over time (T,) [m]."""
+    """Return the root mean square deviation from the spacing of sides shorter than `reach_m`, over time (T,) [m]."""
     i, j = np.triu_indices(p.shape[1], 1)
     lengths = np.linalg.norm(p[:, i] - p[:, j], axis=2)
     squared = np.where(lengths < reach_m, (lengths - spacing_m) ** 2, np.nan)

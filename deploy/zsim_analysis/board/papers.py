@@ -219,9 +219,9 @@ def lines(progress: Callable[[str], None] = lambda _: None) -> Iterator[Line]:
     for with_aim in (True, False):
         progress(f"a flock of {FLOCK}, {'with' if with_aim else 'without'} an aim …")
         track = free_flock(with_aim=with_aim)
-        variant = "with its aim" if with_aim else "without, for comparison"
+        variant = "with its aim" if with_aim else "without it, for comparison"
         line = partial(Line, "Olfati-Saber 2006")
-        yield line(f"relative connectivity of {FLOCK}, {variant}", 1.0, float(track.connectivity[-1]))
+        yield line(f"relative connectivity of {FLOCK} agents, {variant}", 1.0, float(track.connectivity[-1]))
         yield line(f"deviation energy / d^2, {variant}", 0.0, float(track.energy[-1]))
         yield line(f"velocity mismatch (m/s), {variant}", 0.0, float(track.mismatch[-1]))
     progress("shapes by bearings …")
@@ -230,7 +230,7 @@ def lines(progress: Callable[[str], None] = lambda _: None) -> Iterator[Line]:
     yield line("drift of the centroid (m)", 0.0, max(track.centroid_drift for track in tracks))
     yield line("drift of the scale (m)", 0.0, max(track.scale_drift for track in tracks))
     reached_count = sum(float(track.distance[-1] < REACHED_M) for track in tracks)
-    yield line(f"starts of {STARTS} from which the figure is reached", float(STARTS), reached_count)
+    yield line(f"number of starts, out of {STARTS}, from which the figure is reached", float(STARTS), reached_count)
 
 
 def write_papers(out: Path, progress: Callable[[str], None]) -> list[Line]:
@@ -298,7 +298,7 @@ def _flocking(led: FlockTrack, free: FlockTrack) -> style.ReportFigure:
     panels[1, 2].set_visible(False)
     style.letter_panels([*panels[0], *panels[1, :2]])
     style.legend_above(figure, panels[0, 0])
-    caption = f"{FLOCK} agents, d = 7 m, r = 1.2 d, from starts of 50 m standard deviation."
+    caption = f"{FLOCK} agents, d = 7 m, r = 1.2 d, from starts with a standard deviation of 50 m."
     return style.ReportFigure("flocking.png", "Flocking in free space, after Olfati-Saber 2006", caption, figure)
 
 

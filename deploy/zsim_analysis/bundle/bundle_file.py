@@ -59,7 +59,7 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     scenario_sha256: str
     truth_sha256: str
     outputs: dict[str, str]  # SHA-256 of the agents' outputs by key, as in OutputHashes; empty if none are run again
-    until_ns: int  # last gate whose outputs are compared; those of later gates may be missing from the record
+    until_ns: int  # time of the last gate whose outputs are compared; later ones may be missing from the record
     own_code: list[str]  # users' classes, functions and modules that the scenario names
     needs: list[str]  # NAME==VERSION of the packages other than zsim's that these import
     not_run_again: str  # why commands are read from the record instead of running the agents again; else empty
@@ -128,7 +128,7 @@ def open_bundle(path: Path) -> Iterator[tuple[Manifest, Path]]:
     """Check a bundle; yield its manifest and a temporary folder with its members.
 
     Raises:
-        RunError: no bundle, or a changed one; the error names the member, and what was found and expected.
+        RunError: the file is not a bundle, was changed, or cannot be read.
     """
     try:
         with zipfile.ZipFile(path) as archive:

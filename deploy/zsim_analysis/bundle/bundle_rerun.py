@@ -26,7 +26,7 @@ from zsim_analysis.reading.recorded_run import GateDigests, OutputHashes, conten
 from zsim_analysis.rerun import rerun_record
 
 Say = Callable[[str], None]
-SHOWN = 8  # most differences listed in a line
+SHOWN = 8  # maximum number of differences listed in a line
 
 
 def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
@@ -37,7 +37,8 @@ def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
         commands_only, say, note: as in `rerun_record`.
 
     Raises:
-        RunError: the file is not a bundle, was changed, or names code of its own that may not be run.
+        RunError: the file is not a bundle or was changed, its scenario names code that may not be run, or
+            `commands_only` is given for a bundle without a record.
         ScenarioError, RecordError: this version cannot read the bundle's scenario or record.
     """
     with open_bundle(path) as (manifest, folder):
@@ -52,12 +53,12 @@ def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
             raise RunError(f"{path}: has no {names.RECORD} with commands; omit --commands-only")
         else:
             if manifest.zsim != __version__:
-                note(f"flown by zsim {manifest.zsim}, flown again by {__version__}: the same bits are not promised")
+                note(f"flown by zsim {manifest.zsim}, flown again by {__version__}: the same bits are not guaranteed")
             fault = _fly_again(manifest, folder, scenario, say)
         if fault:
             _note_machines(manifest, note)
         else:
-            say(f"the same to the bit: {manifest.name}, {manifest.duration_s:g} s, {len(scenario.drones)} drones")
+            say(f"bit-identical: {manifest.name}, {manifest.duration_s:g} s, {len(scenario.drones)} drones")
         return fault
 
 
@@ -65,7 +66,8 @@ def check_content(path: Path, manifest: Manifest, folder: Path) -> Scenario:
     """Return the scenario of a bundle after checking that it matches manifest and record and may be flown here.
 
     Raises:
-        RunError: the scenario does not match manifest and record, or names code that may not be run.
+        RunError: the scenario does not match manifest and record, or names code that may not be run; or the bundle has
+            neither record nor gates.
     """
     try:
         text = (folder / names.SCENARIO).read_text("utf-8")
@@ -84,7 +86,7 @@ def check_content(path: Path, manifest: Manifest, folder: Path) -> Scenario:
         raise RunError(f"{path}: contains neither {names.RECORD} nor {names.GATES}; must contain one of them")
     scenario = scenario_file.from_text(text)
     if (own := scenario.own_code()) and not plugin.may_import():
-        raise RunError(f"{path}: its scenario names {listed(own)}: code that a rerun runs, and only with --trust")
+        raise RunError(f"{path}: its scenario names {listed(own)}: code that is run only with --trust")
     return scenario
 
 
@@ -142,8 +144,8 @@ def _note_machines(manifest: Manifest, note: Say) -> None:
     """Note the differences between the machine that flew the bundle and this one."""
     this_machine = {**machine(), **parts()}
     if not manifest.machine:
-        fingerprints = f"of fingerprint {', '.join(manifest.fingerprints)}, here {fingerprint()}"
-        note(f"the machines: the one that flew the bundle is unknown, {fingerprints}")
+        fingerprints = f"its fingerprint is {', '.join(manifest.fingerprints)}, here {fingerprint()}"
+        note(f"the machine that flew the bundle is unknown; {fingerprints}")
     elif differing := [
         f"{name} {manifest.machine.get(name, 'none')}, here {this_machine.get(name, 'none')}"
         for name in sorted({*manifest.machine, *this_machine})

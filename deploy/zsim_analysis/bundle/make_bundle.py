@@ -67,7 +67,7 @@ def make_bundle(
     Args:
         run_path: the folder of the run, or its record.
         out: the bundle file; None: named after the scenario, in the working folder.
-        with_record: whether to include the record; only a flight that its scenario alone reproduces can do without.
+        with_record: whether to include the record; may be False only if the scenario alone reproduces the flight.
         force: whether to replace an existing file.
         note: called with a line for each thing that the bundle lacks or does not hide.
 

@@ -39,15 +39,15 @@ class MessageSelection(NamedTuple):
     """Keys and times to be exported."""
 
     expressions: tuple[str, ...] = ()  # key expressions as in Zenoh; empty: every key
-    from_s: float | None = None  # simulated time from which on to export [s]; None: from the start
-    to_s: float | None = None  # simulated time up to which to export [s]; None: to the end
+    from_s: float | None = None  # first simulated time to export [s]; None: that of the start
+    to_s: float | None = None  # last simulated time to export [s]; None: that of the end
 
     def keys(self, reader: RecordReader) -> list[str]:
         every = not self.expressions
         return [key for key in reader.topics() if every or any(keys.matches(each, key) for each in self.expressions)]
 
     def messages(self, reader: RecordReader, selected_keys: list[str]) -> Iterator[Recorded]:
-        """Yield the messages of the `selected_keys` keys within the times, in order of simulated time."""
+        """Yield the messages on `selected_keys` within the times, in order of simulated time."""
         first = 0 if self.from_s is None else round(self.from_s * 1e9)
         last = 2**64 if self.to_s is None else round(self.to_s * 1e9)
         return (message for message in reader.messages(frozenset(selected_keys)) if first <= message.t_ns <= last)
@@ -213,7 +213,7 @@ def _components(name: str, info: inspect.Type) -> list[str]:
     """Return the columns of a field with a fixed number of elements; empty for any other field."""
     if isinstance(info, inspect.VarTupleType) and info.min_length == info.max_length == 36:
         parts = [f"{i}{j}" for i in range(6) for j in range(6)]
-    elif isinstance(info, inspect.VarTupleType) and info.min_length == len(ROTORS):  # at most the first four
+    elif isinstance(info, inspect.VarTupleType) and info.min_length == len(ROTORS):  # of more rotors, the first four
         parts = list(ROTORS)
     elif not isinstance(info, inspect.TupleType) or not all(isinstance(each, _NUMERIC) for each in info.item_types):
         parts = []

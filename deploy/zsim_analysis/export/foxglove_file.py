@@ -120,9 +120,9 @@ def _decode(recorded: Recorded) -> Any:
 
 
 def _rotors(info: Info | None, scenario: Scenario | None, present: Mapping[str, None]) -> dict[str, list[RotorDisc]]:
-    """Return the rotors of every drone on record, in the order of the scenario.
+    """Return the rotors of every drone in the record, in the order of the scenario.
 
-    If `world/info` does not give a drone's rotors, they are assumed to form a cross.
+    If `world/info` does not give a drone's rotors, they are assumed to form an X.
     """
     arms_m = {drone.name: drone.arm_m for drone in scenario.drones} if scenario else {}
     rotors_by_drone = {drone.name: drone.rotors for drone in info.drones} if info else {}
@@ -277,14 +277,14 @@ class FoxgloveFile:
             kind = NumericMessageType(f"Cluster_{build.tidy(name)}", [*fields, "margin"], ("phase", "reason"))
             self.variables[name] = kind
         numbers = self.variables[name]
-        true = [math.nan] * len(state.names)  # kept unless all drones' truth is known and their shape is not singular
+        true = [math.nan] * len(state.names)  # replaced if space and truth are known and the shape is not singular
         space, truths = self._spaces.get(name), [instant.truth[d] for d in state.drones if d in instant.truth]
         if space is not None and space.names == state.names and len(truths) == len(state.drones):
             yaw = heading([truth.orientation_wxyz for truth in truths])
             with suppress(SingularClusterError):
                 true = space.forward(np.array([truth.position_m for truth in truths]), yaw).tolist()
         values = [*state.desired, *state.value, *true, state.margin]
-        if len(values) == len(numbers.numbers):  # nothing more is written once the number of variables has changed
+        if len(values) == len(numbers.numbers):  # nothing is written if the number of variables has changed
             encoded = numbers.encode(values, (state.phase, state.reason))
             self._log(f"/cluster/{name}/variables", numbers, encoded, instant.t_ns)
 

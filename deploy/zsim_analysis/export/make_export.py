@@ -115,7 +115,7 @@ def _tables(
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
         notes = [*record_notes(reader), *_refused(decoded.refused)]
         if survey.pictures:
-            notes.append(f"{survey.pictures} pictures are left out: tables hold none; --format foxglove has them")
+            notes.append(f"{survey.pictures} pictures are left out: tables cannot hold them; use --format foxglove")
         if form is not Format.MAT:
             content = {
                 "record": str(reader.path.resolve()),
@@ -153,7 +153,7 @@ def _foxglove(
 
 
 def _refused(count: int) -> list[str]:
-    return [f"{count} messages on record do not match the type of their key and were left out"] if count else []
+    return [f"{count} messages in the record do not match the type of their key and were left out"] if count else []
 
 
 def _nothing(reader: RecordReader, selection: MessageSelection) -> str:
@@ -210,9 +210,9 @@ def staged_outputs(*targets: Path) -> Iterator[tuple[Path, ...]]:
     Existing targets are replaced: call `check_free` first.
 
     Raises:
-        ReportError: they cannot be written.
+        ReportError: the outputs cannot be written.
     """
-    # beside the target, so that files can be renamed; a TemporaryDirectory would remain after Ctrl-C in its creation
+    # beside the target, to allow renaming; a TemporaryDirectory would remain after Ctrl-C during its creation
     folder, new_parents = targets[0].parent / f".export-{secrets.token_hex(4)}", list[Path]()
     try:
         new_parents += [parent for parent in targets[0].parents if not parent.exists()]
@@ -234,7 +234,7 @@ def staged_outputs(*targets: Path) -> Iterator[tuple[Path, ...]]:
             raise
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else error  # without text that libraries add
-        raise ReportError(f"{targets[0]}: cannot be written ({reason}); make room and export again") from error
+        raise ReportError(f"{targets[0]}: cannot be written ({reason}); remove the cause and export again") from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         with suppress(OSError):  # a folder that is not empty stays, and so do its parents
@@ -244,7 +244,7 @@ def staged_outputs(*targets: Path) -> Iterator[tuple[Path, ...]]:
 
 # Tables
 
-ROW_GROUP = 65_536  # rows of a Parquet row group, one of which is held in memory per table
+ROW_GROUP = 65_536  # rows per Parquet row group; one row group is held in memory per table
 _TYPES = {"whole": pa.int64(), "number": pa.float64(), "flag": pa.bool_(), "text": pa.string()}
 
 
@@ -257,7 +257,7 @@ class WrittenTable(NamedTuple):
 
 
 class TableFolder:
-    """A folder of tables, one per message type, or per type and name; each file is opened with its first rows."""
+    """A folder of tables, one per message type, or per type and name; the first rows of each open its file."""
 
     def __init__(self, folder: Path, suffix: str, survey: TableSurvey) -> None:
         self._folder = folder
@@ -444,6 +444,6 @@ def _bytes(value: Any) -> int:
 def _check_size(variable: str, size: int) -> None:
     if size > VARIABLE_MAX:
         raise ReportError(
-            f"{variable}: would have {size / 2**30:.1f} GB; must be < 2 GB for MATLAB to load it from a MAT file of "
-            "Level 5; choose --keys, --from and --to, or --format parquet, which MATLAB reads with parquetread"
+            f"{variable}: would be {size / 2**30:.1f} GB; must be < 2 GB for MATLAB to load it from a Level 5 "
+            "MAT-file; select less by --keys, --from and --to, or use --format parquet (parquetread in MATLAB)"
         )

@@ -28,11 +28,11 @@ CURVES: tuple[tuple[str, str, Literal["solid", "dashed"]], ...] = (
     ("true", "#0072b2", "solid"),
 )
 DRONE_PLOTS = {"altitude (m)": "true_z_m", "error of the estimate (m)": "error_m", "battery (%)": "battery_percent"}
-PLOTS_MAX = 12  # most plotted variables per cluster: as many as the paper's three drones have
+PLOTS_MAX = 12  # maximum number of plotted variables per cluster: as many as the paper's three drones have
 TAB = 3  # plots per tab
-DRONES_MAX = 12  # largest number of plotted drones
+DRONES_MAX = 12  # maximum number of plotted drones
 PICTURES, CALIBRATION = "_camera/image", "_camera/calibration"  # suffixes of topics
-PICTURES_MAX = 6  # most cameras shown: as many as the paper's three drones have
+PICTURES_MAX = 6  # maximum number of cameras shown: as many as the paper's three drones have
 TIMELINE = "message_log_time"  # Rerun's name of the MCAP file's log time: simulated time
 ROTOR_CORNERS = 16  # corners of a rotor's disc
 # position and target of the eye in W; design choice: they show the paper's formation from the ground to 15 m

@@ -28,7 +28,7 @@ from rich.console import Console
 
 from zsim import __version__
 from zsim.errors import ReportError, RunError, ScenarioError
-from zsim.output_folder import held_folder
+from zsim.output_folder import locked_folder
 from zsim.scenario.faults import PROCESS_KILL
 from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
@@ -46,7 +46,7 @@ PLAN, TABLE, SCENARIO, VIOLATION = "hunt.json", "flights.csv", "violation.yaml",
 BUNDLE = "violation.zsim"
 OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, BUNDLE, "summary.json", "report.html", "figures", ".lock")
 SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages besides those of `shrink`
-SAME_BITS = "same_bits"  # quantity: whether truth is bit-identical to that of the same flight with no process dying
+SAME_BITS = "same_bits"  # quantity: whether truth is bit-identical to that of the same flight in which no process dies
 MISSES_MAX = 100  # successive draws that cannot be flown, after which --vary is deemed wrong; design choice
 DECIMALS = 6  # decimals of margins in the table
 
@@ -64,7 +64,7 @@ class HuntRequest(Struct, frozen=True):
     seed: int = 1  # seed of the draws
     flights: int | None = None
     budget_s: float | None = None
-    faults: tuple[str, ...] = ()  # texts of `--fault`; empty: all kinds
+    faults: tuple[str, ...] = ()  # texts of `--fault`; empty: all kinds except deaths of processes
     without: tuple[str, ...] = ()  # kinds of faults that are not drawn
     vary: tuple[str, ...] = (WIND,)
     changed: tuple[str, ...] = ()  # overrides `a.b.c=value` already applied to the document
@@ -117,7 +117,7 @@ class Violation(Struct, frozen=True):
     number: int  # number of the flight in which it was found
     found: Case
     shrunk: Case
-    margin: float | None  # margin of the shrunk flight; None if a quantity is unknown
+    margin: float | None  # margin of the recorded flight, or else of the one found; None if it is unknown
     unknown: str  # the unknown quantity, or why the flight failed
     causes: list[CauseFound]
     options: list[str]  # options with which `zsim run` of the scenario flies the shrunk flight
@@ -163,14 +163,15 @@ def hunt(request: HuntRequest) -> Hunted:
 
     Raises:
         ScenarioError: a requirement, a fault, a field or the scenario is wrong; one line for each.
-        RunError: the folder holds something else or cannot be written, or workers cannot start.
+        RunError: the folder holds another hunt or other files, is in use or cannot be made, or workers cannot start.
+        ReportError: the folder cannot be written.
     """
     texts, document = _with_functions(request.requirements, request.document)
     requirements = _requirements(texts)
     space = HuntSpace(document, request.source, request.faults, request.without, request.vary, request.most)
     if (request.out / PLAN).exists() and not request.force:
         raise RunError(f"{request.out}: already holds a hunt; --force replaces it, or give --out another folder")
-    with held_folder(request.out, PLAN, OWN_FILES, request.force, "hunt into", "another hunt is running"):
+    with locked_folder(request.out, PLAN, OWN_FILES, request.force, "hunt into", "another hunt is running"):
         rmtree(request.out / VIOLATION, ignore_errors=True)  # left by an earlier hunt
         for name in (SCENARIO, BUNDLE):
             (request.out / name).unlink(missing_ok=True)
@@ -214,7 +215,7 @@ _requirement = lru_cache(maxsize=64)(Requirement)
 def judge_flight(requirements: Sequence[str], twin: Scenario | None, summary: RunSummary, row: Row) -> dict[str, Any]:
     """Return the margins of a flight, or why they cannot be computed; called in the process that flew it.
 
-    `twin` is the same flight with no process dying, with which it is compared bit by bit; None if no process dies.
+    `twin` is the same flight without deaths of processes, flown for SAME_BITS; None if the flight has none.
     """
     columns = {name: row[name] for name in row if name in FIXED or name.startswith((METRIC, "clusters."))}
     quantities = {**columns, **dict(quantities_of(msgspec.to_builtins(summary)))}

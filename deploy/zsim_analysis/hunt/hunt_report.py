@@ -30,7 +30,7 @@ from zsim_analysis.report import figure_style as style
 from zsim_analysis.report.make_report import Picture, make_report, rendered, write_report
 
 QUARTERS = 4  # parts of a range, each with its number of flights
-KINDS_DRAWN = 24  # most kinds for which the matrix of pairs is drawn
+KINDS_DRAWN = 24  # maximum number of kinds for which the matrix of pairs is drawn
 
 
 def make_hunt_report(
@@ -83,8 +83,8 @@ def _margins(summary: HuntSummary, searched: Sequence[HuntFlight]) -> style.Repo
         axes.set_title(text, fontsize=style.PAPER_PT, color=style.DARK, loc="left")
     panels[-1].set_xlabel("flight", fontsize=style.PAPER_PT)
     caption = (
-        "Margin of each flight of the search to violating a requirement, in the unit of its quantities; crosses below "
-        "0 are violations. Line: the smallest margin so far. Vertical line: a quantity is unknown."
+        "Distance of each flight of the search from violating a requirement, in the unit of its quantities; crosses "
+        "are violations. Line: the smallest margin so far. Vertical line: a quantity is unknown, or the flight failed."
     )
     return style.ReportFigure("margins.png", "Margins over the flights", caption, figure)
 
@@ -159,7 +159,7 @@ def facts(request: HuntRequest, summary: HuntSummary) -> list[tuple[str, str]]:
 
 
 def kind_row(space: KindSpace, searched: Sequence[HuntFlight]) -> list[str]:
-    """Return a kind, how often it was flown, its smallest margin, and the flights per quarter of each range."""
+    """Return a kind, how often it was flown, its smallest margin, and its targets and flights per quarter of ranges."""
     matching = [(each, fault) for each in searched for fault in each.case.faults if fault["kind"] == space.name]
     min_share = min((each.worst.share for each, _ in matching), default=None)
     targets = {fault["target"] for _, fault in matching}

@@ -21,7 +21,7 @@ from zsim.schema.checker import show, suggestion
 OPTION = "--require"
 SYNTAX = "comparisons of quantities and numbers, as in 'min_separation_m > 1.5 and not crashed'"
 LENGTH_MAX = 1000  # longest requirement [characters]
-NAMES_SHOWN = 12  # most names listed in an error
+NAMES_SHOWN = 12  # maximum number of names listed in an error
 TINY = 1e-12  # smallest denominator of a share
 _COMPARES = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _ARITHMETIC: dict[type, Callable[[float, float], float]] = {
@@ -40,7 +40,7 @@ class Margin(NamedTuple):
     # relative to the larger side of the comparison, from -2 to 2; in a hunt, relative to the margin without faults
     share: float
     value: float | None  # in the unit of the quantities; None if one of them is unknown
-    unknown: str = ""  # the first quantity that the flight does not have; empty if it has all
+    unknown: str = ""  # the first unknown quantity, or why the flight failed; empty if neither
 
     def __invert__(self) -> "Margin":
         if self.unknown:
@@ -74,7 +74,7 @@ class Requirement:
         """Return the margin in a flight, given its quantities by path.
 
         Raises:
-            ScenarioError: the requirement names a quantity that no flight has, or compares a text with a number.
+            ScenarioError: the requirement names a quantity that no flight has, or one of the wrong type.
         """
         return self._margin(self._tree, quantities)
 

@@ -19,11 +19,11 @@ from msgspec.structs import replace
 from zsim.scenario.scenario_file import steps_of
 from zsim_analysis.hunt.space import Case, HuntSpace
 
-SUBSETS_MAX = 6  # most causes of which all proper subsets are flown: at most 63 flights
+SUBSETS_MAX = 6  # maximum number of causes of which all proper subsets are flown: at most 63 flights
 ROUNDS = 3  # rounds of a bisection, each of which reduces the interval to a quarter
 PASSES = 2  # passes over all numbers, since a smaller number may allow another to become smaller
 SHARES = (0.25, 0.5, 0.75)  # candidates of a round, as shares of the interval
-RATIO = 30.0  # ratio of two numbers from which on they are interpolated logarithmically
+RATIO = 30.0  # ratio of two numbers at or above which they are interpolated logarithmically
 SHORTEST_S = 1.0  # shortest duration of a flight; design choice
 CAUSES, NUMBERS, DURATION = "fewest causes", "smallest values", "shortest flight"  # stages
 
@@ -118,8 +118,8 @@ class Shrinker:
             case = candidates[violates.index(True)]
 
     def _bisect(self, case_of: Callable[[float], Case], value: float, mildest: float, case: Case) -> Case:
-        """Return the case with the number closest to `mildest` that still violates, with few digits if possible."""
-        low, high = 0.0, 1.0  # interval between the mildest number (0) and the one that violates (1)
+        """Return the case with the number closest to `mildest` that violates the requirement, rounded if possible."""
+        low, high = 0.0, 1.0  # interval between the mildest number (0) and the one that violates the requirement (1)
         for _ in range(ROUNDS):
             shares = [low + share * (high - low) for share in SHARES]
             violates = self._breaks([case_of(_between(mildest, value, share)) for share in shares], NUMBERS)
@@ -147,7 +147,10 @@ class Shrinker:
     # Duration
 
     def shortest_flight(self, case: Case) -> Case:
-        """Return the case with the shortest flight that violates the requirement, but would not without its causes."""
+        """Return the case with the shortest flight that violates the requirement, but would not without its causes.
+
+        A case without faults is returned unchanged.
+        """
         if not case.faults:
             return case
         length_s = case.duration_s or self._space.base.duration_s
@@ -214,7 +217,7 @@ def _round(x: float, digits: int = 4) -> float:
 
 
 def _outward(number: float, mildest: float, value: float, digits: int) -> float | None:
-    """Round a number to few digits, away from the mildest; return None if that exceeds the original value."""
+    """Round a number to significant digits, away from the mildest; None if that passes `value` or changes nothing."""
     if number == 0:
         return None
     unit = 10.0 ** (math.floor(math.log10(abs(number))) - digits + 1)

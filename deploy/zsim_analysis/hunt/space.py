@@ -7,13 +7,13 @@ beyond normal flight. If a limit is LARGE or more, magnitudes are drawn from SMA
 100 m/s); in both cases all decades are equally likely. Shares and probabilities are drawn uniformly. Rules narrow
 ranges: `gust velocity_m_s=1..6 for_s=2..8`.
 
-The strategy covers all small combinations of kinds, and exploits low margins. Every second flight has a pair of kinds
-that has not been tried together, or a triple once all pairs have been (Kuhn, Wallace and Gallo, IEEE Transactions on
-Software Engineering 30, 2004: few simultaneous conditions suffice to make software fail). The others are neighbours of
-the flights with the lowest margins, of which the lowest for each set of kinds is kept (MAP-Elites of Mouret and Clune,
-arXiv 1504.04909): numbers are moved slightly, or a fault is replaced or taken from another elite. Draws depend on the
-seed, the number of the flight and the margins of flights at least LAG before it, but not on the number or speed of
-processes.
+The strategy covers all small combinations of kinds, and exploits low margins. At least every second flight has a kind
+that has not been tried; once all kinds have been, a pair that has not been tried together; then a triple (Kuhn, Wallace
+and Gallo, IEEE Transactions on Software Engineering 30, 2004: few simultaneous conditions suffice to make software
+fail). Most others, and most flights once all combinations have been tried, are neighbours of the flights with the
+lowest margins, of which the lowest for each set of kinds is kept (MAP-Elites of Mouret and Clune, arXiv 1504.04909):
+numbers are moved slightly, or a fault is replaced or taken from another elite. Draws depend on the seed, the number of
+the flight and the margins of flights at least PENDING_MAX before it, but not on the number or speed of processes.
 """
 
 import copy
@@ -46,11 +46,11 @@ SYNTAX = "a kind and NAME=LOW..HIGH or NAME=VALUE, as in 'gust velocity_m_s=1..6
 WIND = "environment.wind.gust_m_s=uniform(0, 2)"  # default of --vary; design choice
 LARGE, SMALL_SHARE, LARGE_SHARE = 1000.0, 1e-5, 1e-2  # design choice; see the module docstring
 FAULT_MIN_S = 0.5  # shortest duration of a fault; design choice: shorter ones would last only a few samples
-DECADES = 30.0  # ratio of the ends of a range from which on all decades are equally likely
+DECADES = 30.0  # ratio of the ends of a range at or above which all decades are equally likely
 ONE_WAY_SHARE = 1 / 3  # probability that a flag of a fault is set; design choice
 DIGITS = 4  # significant digits of drawn numbers, so that their texts represent them exactly
 _RANGE = re.compile(r"\s*([-+0-9.eE]+?)\.\.([-+0-9.eE]+)\s*")
-PENDING_MAX = 32  # most pending flights; design choice: more than a machine's processes
+PENDING_MAX = 32  # maximum number of pending flights; design choice: more than a machine's processes
 TRIES = 24  # random sets of kinds, of which the one with the most untried combinations is flown
 STEPS = (0.3, 0.1, 0.03)  # standard deviations of moves, as shares of a range; design choice
 # probability of an untried combination in place of a neighbour, and of a random one if all are tried
@@ -91,7 +91,7 @@ class Knob(Struct, frozen=True):
         return self._compose(self._magnitude(rng.uniform()), _direction(rng, self.shape))
 
     def near(self, value: Any, rng: Generator, step: float) -> Any:
-        """Return a value moved by a normal draw with a deviation of `step` of the range; for a choice, a new draw."""
+        """Return a value moved by a normal draw, with a std of `step` times the range; for a choice, a new draw."""
         if self.shape == "choice" or value is None:
             return self.draw(rng)
         position = self.position(value) + step * rng.normal()
@@ -314,7 +314,7 @@ class HuntSpace:
         return {knob.name: knob for knob in knobs}
 
     def _check_ends(self, rules: Sequence[str]) -> None:
-        """Raise ScenarioError for invalid values, checking both ends of every range and each listed value."""
+        """Raise ScenarioError if ends of ranges, means of normal distributions or listed values are invalid."""
         for path, axis in self.fields.items():
             limits = (axis.first, axis.second) if isinstance(axis, Draw) else axis.values
             for value in limits if isinstance(axis, Grid) or axis.kind == "uniform" else limits[:1]:
@@ -360,10 +360,10 @@ def _given(name: str, text: str, kind: FaultKind) -> Knob:
         raise ValueError(f"is {show(text)}; must be LOW..HIGH, finite numbers with LOW <= HIGH")
     is_number = name in COMMON[2:] or (parameter is not None and parameter.shape in ("number", "vector"))
     if parameter is not None and not is_number:
-        raise ValueError(f"is {show(text)}; must be a value of a {parameter.shape}")
+        raise ValueError(f"is {show(text)}; must be one value, not a range, of the type {parameter.shape}")
     if parameter is not None and parameter.shape == "vector":
         if low < 0:
-            raise ValueError(f"is {show(text)}; must be a range of the magnitude, from 0 on, or [x, y, z]")
+            raise ValueError(f"is {show(text)}; must be a range of the magnitude with LOW >= 0, or [x, y, z]")
         return Knob(name, low, high, "vector")
     return Knob(name, low, high)
 
@@ -483,7 +483,7 @@ class Strategy:
             self.elites[case.kinds] = Elite(margin, case)
 
     def _near(self, rng: Generator) -> Case:
-        """Return a neighbour of one of the best flights, preferring the better ones."""
+        """Return a neighbour of an elite, preferring those with lower margins."""
         ranked = sorted(self.elites.values(), key=lambda elite: (elite.margin.share, elite.case.kinds))
         parent = self._pick(ranked, rng)
         faults, kinds = list(parent.faults), self.space.kinds

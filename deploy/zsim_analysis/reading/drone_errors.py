@@ -14,7 +14,7 @@ from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 
 SIGMAS = 2.0  # half-width of the drawn band in standard deviations
 DEGREES = 6  # degrees of freedom of a drone's NEES: position and velocity
-ESTIMATES_MAX = 200_000  # most estimates evaluated per flight, which takes about a second
+ESTIMATES_MAX = 200_000  # maximum number of estimates evaluated per flight, which takes about a second
 AIRBORNE_PHASES = ("approaching", "path", "holding")  # phases of a reference whose drone is to be in the air
 POSITION, YAW = (0, 1, 2), 3  # columns of errors and of velocities: x, y, z, heading
 INSTANTS = 1500  # number of times at which distances are computed, more than a figure has pixels across
@@ -45,9 +45,9 @@ class VelocityResponse(NamedTuple):
 
 
 def estimate_errors(flight: RecordedFlight) -> dict[str, EstimateErrors]:
-    """Return the errors of the estimates of every drone that has both truth and estimates on record.
+    """Return the errors of the estimates of every simulated drone that has both truth and estimates.
 
-    If there are more than ESTIMATES_MAX estimates, only every n-th truth sample is evaluated.
+    If there are ESTIMATES_MAX estimates or more, only every n-th truth sample is evaluated.
     """
     step = 1 + sum(len(each.t_ns) for each in flight.estimates.values()) // ESTIMATES_MAX
     errors = {}
@@ -84,7 +84,7 @@ def nees(error: Array, covariance: Array) -> Array:
 
 
 class ReferenceErrors(NamedTuple):
-    """Truth − reference of one drone at the K times at which its reference is in a phase of FLOWN."""
+    """Truth − reference of one drone at the K times at which its reference is in one of AIRBORNE_PHASES."""
 
     t_s: Array  # (K,) simulated time
     error: Array  # (K, 4) x, y, z in W [m], heading wrapped to ±π [rad]
@@ -102,7 +102,7 @@ class Tracking(Struct, frozen=True):
 
 
 def reference_errors(flight: RecordedFlight) -> dict[str, ReferenceErrors]:
-    """Return the errors of every drone that has both truth and a reference on record."""
+    """Return the errors of every simulated drone that has both truth and a reference."""
     errors = {}
     for track in flight.tracks:
         if track.external or (references := flight.references.get(track.name)) is None:
@@ -132,7 +132,7 @@ def tracking_of(errors: ReferenceErrors, window_s: tuple[float, float]) -> Track
 
 
 def velocity_responses(flight: RecordedFlight) -> dict[str, VelocityResponse]:
-    """Return the velocities of every drone that has both truth and velocity commands on record."""
+    """Return the velocities of every simulated drone that has both truth and velocity commands."""
 
     def in_heading(v_W: Array) -> Array:
         """Convert velocities (K, 3) from W to forward, left and up."""
@@ -173,7 +173,7 @@ class Separations(NamedTuple):
 
 
 def distances(flight: RecordedFlight, pairs_max: int) -> Distances | None:
-    """Return the distances between simulated drones, by pair if at most `pairs_max`; None for fewer than two drones."""
+    """Return the distances between simulated drones, by pair if at most `pairs_max`; None if there are none."""
     tracks = [track for track in flight.tracks if len(track.t_ns) and not track.external]
     t_ns, indices = common_instants(tracks)
     if len(tracks) < 2 or not len(t_ns):

@@ -22,7 +22,7 @@ class ParameterErrors(Struct, frozen=True):
     """Errors of one cluster parameter against its desired value, in its own unit (m or rad).
 
     `est` is what the controller saw (estimate − desired), `true` what the drones did (truth − desired), over the same
-    samples. std² + mean² = rms². None: no such samples.
+    samples, if any truth is known. std² + mean² = rms². None: no such samples.
     """
 
     est_std: float | None
@@ -107,7 +107,7 @@ def formations_of(flight: RecordedFlight) -> list[Formation]:
 
 
 def formation(states: ClusterStates, tracks: list[Track], scenario: Scenario | None) -> Formation | None:
-    """Return a cluster's formation; None if its controller published nothing, or not the scenario's variables."""
+    """Return a cluster's formation; None without states or space, or if its variables are not the scenario's."""
     if not len(states.t_ns):
         return None
     cluster = cluster_of(scenario, states.name)
@@ -209,7 +209,7 @@ class GoalErrors(NamedTuple):
 
 
 def goal_errors(formation: Formation, scenario: Scenario | None) -> GoalErrors | None:
-    """Return the errors of a formation against its plan's target; None if there is no target, or it is invalid."""
+    """Return the errors of a formation against its plan's target; None without a planned take-off or a valid target."""
     cluster = cluster_of(scenario, formation.name)
     if scenario is None or cluster is None or not cluster.plan.target or cluster.plan.takeoff_s is None:
         return None

@@ -32,7 +32,7 @@ from zsim_analysis.reading.recorded_run import scenario_of, search_modules
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 TRUTH_WIDTH = 13  # position, velocity, orientation, angular velocity
-CONNECTED_MIN = 0.5  # reception probability from which a link counts as connected; this defines the range
+CONNECTED_MIN = 0.5  # minimum reception probability of a connected link; this defines the range
 
 
 @dataclass
@@ -115,7 +115,7 @@ class ClusterStates:
     orders: list[str] = field(default_factory=list)  # (K,) drones in the order of the robots, separated by spaces
 
     def robot_of(self, row: int, drone: str) -> int:
-        """Return a drone's index as a robot in a row, or its index in `drones` if no order is on record."""
+        """Return a drone's index as a robot in a row, or its index in `drones` if the row's order lacks it."""
         order = self.orders[row].split() if self.orders else []
         return order.index(drone) if drone in order else self.drones.index(drone)
 
@@ -192,7 +192,7 @@ def _graph(
 
 @dataclass
 class RecordedFlight:
-    """Everything that a report needs of a flight; fields that are not on record are None or empty."""
+    """Everything that a report needs of a flight; fields that are not in the record are None or empty."""
 
     info: Info | None
     scenario: Scenario | None
@@ -200,7 +200,7 @@ class RecordedFlight:
     clusters: list[ClusterStates]
     events: list[Event]
     processes: list[RecordedProcess]
-    messages: int  # number of messages on record, over all keys
+    messages: int  # number of messages in the record, over all keys
     completeness: Completeness
     wall_s: float  # wall time from the first to the last truth message, by the recorder's clock
     undecoded: int = 0  # number of payloads that do not match the type of their key
@@ -208,8 +208,8 @@ class RecordedFlight:
     # estimates and commands by drone; empty unless requested
     estimates: dict[str, DroneEstimates] = field(default_factory=dict)
     commands: dict[str, VelocityCommands] = field(default_factory=dict)
-    others: dict[str, int] = field(default_factory=dict)  # number of messages by key, of the keys that no report reads
-    cpu_s: float | None = None  # CPU time from the first gate to the last of a flight in a process of its own
+    others: dict[str, int] = field(default_factory=dict)  # in process: number of messages by key that no report reads
+    cpu_s: float | None = None  # CPU time of this process from the first gate to the last; None for a record
     radio: RadioHistory | None = None  # None if the scenario has no radio
     references: dict[str, DroneReferences] = field(default_factory=dict)  # of drones that fly on their own, by drone
 
@@ -517,8 +517,8 @@ class FlightReader:
     def _obeyed_commands(self) -> dict[str, VelocityCommands]:
         """Return the commands that each drone obeyed, by time.
 
-        A command was obeyed if the latest status names its source as commander, or if the latest status names no
-        commander and the next one names none or this source.
+        A command was obeyed if the latest status names its source as commander, or if it names no commander and the
+        next commander, if any, is this source. Without any status, all commands count as obeyed.
         """
         by_drone: defaultdict[str, list[tuple[Times, np.ndarray]]] = defaultdict(list)
         for (drone, source), rows in self._commands.items():

@@ -52,7 +52,7 @@ def open_run(run_path: Path) -> Iterator[RecordedRun]:
 
     Raises:
         RunError: there is no record.
-        RecordError: the file is not a record, or has no world/info.
+        RecordError: the file is not a record, or has no world/info of this version.
         ScenarioError: this version cannot read the scenario.
     """
     with RecordReader(record_at(run_path)) as reader:
@@ -87,10 +87,10 @@ def is_answer(key: str) -> bool:
 
 
 def answered_until_ns(reader: RecordReader, info: messages.Info) -> int:
-    """Return the last gate [ns] whose answers are all on record, as the last recorded gate needed them.
+    """Return the last gate [ns] whose answers are all in the record, as the last recorded gate needed them.
 
     Raises:
-        RecordError: there is no gate on record.
+        RecordError: the record has no gate.
     """
     clock = reader.last(keys.CLOCK)
     if clock is None:
@@ -117,7 +117,7 @@ def command_age_ms(path: Path) -> dict[str, float] | None:
     """Return p50, p99 and max [ms] of the wall time from a drone's status to the command that answers it.
 
     Both times are those at which the recorder received the messages. This is for runs whose world ended before it
-    reported its own statistics. None if no command on record answers a status.
+    reported its own statistics. None if no recorded command answers a status.
     """
     with RecordReader(path) as reader:
         selected_keys = {
@@ -224,7 +224,7 @@ class RecordedAgents(NamedTuple):
 def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenario) -> RecordedAgents:
     """Return the agents that took part in the run of a record.
 
-    Processes that announce no fingerprint, or serve names that are not agents of the scenario, are left out.
+    Processes that announce no version or fingerprint, or serve names that are not agents of the scenario, are left out.
     """
     expected = set(agents_of(scenario)) if scenario.drones else set()
     joins = [(keys.thing(key), join) for key, join in _read(reader, "process/*/join")]
@@ -331,7 +331,7 @@ class OutputHashes:
     """SHA-256 of the outputs of agents up to a gate, by key.
 
     Args:
-        until_ns: the last gate whose outputs are hashed; those of later gates may be missing from the record.
+        until_ns: time of the last gate whose outputs are hashed; those of later gates may be missing from the record.
     """
 
     def __init__(self, until_ns: int) -> None:

@@ -53,7 +53,7 @@ class Shortfall(Struct, frozen=True):
     # strayed (far from its position or reference), reference (no take-off), override (flown by others); clusters:
     # plan (a step refused to the end, or flown in part), engagement (never), held (too long), request (commanded by
     # others), early (the run ended before a step was due), window (not engaged throughout it); and collision, process
-    # (an expected one died, failed, or never joined), record (incomplete)
+    # (an expected one died, failed, left or never joined), record (incomplete)
     kind: str
     subject: str  # the cluster, drone, process, or "record"; for a collision both parties, as "drone1, drone2"
     t_s: float  # simulated time at which it began
@@ -182,7 +182,7 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
         in_order = sorted(first.values(), key=lambda event: (event.t_ns, event.seq))
         parts = [_incident_text(event, _refusal_before(event, flight)) for event in in_order]
         text = f"{drone}: {', '.join(parts)}{_active_faults(drone, (events[0].t_ns, events[0].seq), flight)}"
-        fails = not all(  # a landing because a program other than a controller fell silent is not a failure
+        fails = not all(  # a landing because a program other than a plan's controller fell silent is not a failure
             event.kind == "landing"
             and event.data.get("cause") == "silence"
             and not str(event.data.get("commander") or "").startswith(CONTROLLER)
@@ -320,7 +320,7 @@ def _reference_shortfalls(drone: str, flight: RecordedFlight) -> Iterator[Shortf
     if not is_flown.any():
         if end_s - takeoff_s >= ENGAGES_S:
             state = track.states[-1] if track and track.states else "unknown"
-            text = f"{drone}: did not take off by its reference at {seconds_text(takeoff_s)} s; it is {state}"
+            text = f"{drone}: did not take off with its reference at {seconds_text(takeoff_s)} s; it is {state}"
             yield Shortfall("reference", drone, takeoff_s, text, True)
         return
     if track is None or track.external:
@@ -352,7 +352,7 @@ def _cluster_shortfalls(
     if "engaged" not in states.phases:
         phase = states.phases[-1]
         if takeoff_s is None:
-            yield _line(states, "window", 0.0, "never engaged; it has no plan to take off by")
+            yield _line(states, "window", 0.0, "never engaged; it has no planned take-off")
         elif takeoff_s >= end_s:
             yield _line(states, "early", end_s, f"the run ended before its take-off at {seconds_text(takeoff_s)} s")
         elif end_s - takeoff_s < ENGAGES_S:

@@ -242,7 +242,7 @@ def notes(runs: Sequence[ComparedRun]) -> list[str]:
     by_hash: dict[str, list[str]] = {}
     for run in runs:
         by_hash.setdefault(run.summary.truth_sha256, []).append(run.name)
-    lines += [f"{_listed(names)} are identical to the bit." for names in by_hash.values() if len(names) > 1]
+    lines += [f"{_listed(names)} are bit-identical." for names in by_hash.values() if len(names) > 1]
     lines += _missing("Drone", {run.name: [track.name for track in run.flight.tracks] for run in runs})
     lines += _missing("Cluster", {run.name: [formation.name for formation in run.formations] for run in runs})
     for cluster in clusters(runs):
@@ -273,16 +273,16 @@ def _listed(names: Sequence[str]) -> str:
 
 # Figures
 
-COLUMNS = 3  # most runs in a row of a figure
+COLUMNS = 3  # maximum number of runs in a row of a figure
 MARGIN_SHARE = 0.03  # margin beyond the largest RMS, as a share of the axis, so that its mark is not cut off
-ROWS_MAX = 24  # most parameters in one figure: those of 6 drones
+ROWS_MAX = 24  # maximum number of parameters in one figure: those of 6 drones
 DESIRED: dict[str, Any] = {"color": style.BLACK, "lw": 1.0, "ls": (0, (1, 2)), "zorder": 6}
 LANE_IN = 0.24  # height of a run's lane of marks
 HATCHES = {"assembly": "////", "held": "xxxx", "landing": "....", style.FAULT: "", style.TAKE_OVER: "\\\\\\\\"}
 POINTS = {"take-off": "^", "engagement": "D", "collision": "X"}
 FACE, FAULT_FACE = 0.35, 0.65
 EMPTY, GREY_FACE = "#e6eaee", "#b6bfc9"  # colours of an empty lane and of a bar in the legend
-NAME_MAX = 20  # most characters of a run's name beside its lane
+NAME_MAX = 20  # maximum number of characters of a run's name beside its lane
 
 
 def clusters(runs: Iterable[ComparedRun]) -> list[str]:
@@ -354,7 +354,7 @@ def _cluster_figures(runs: Sequence[ComparedRun], cluster: str) -> Iterator[styl
     yield style.ReportFigure(
         f"rms_{cluster}.png",
         f"Errors of the formation's parameters{suffix}",
-        "Root of the mean square of truth − desired (full marks) and of estimate − desired (hollow marks) within the "
+        "Root mean square of truth − desired (filled marks) and of estimate − desired (hollow marks) within the "
         "window of each run.",
         _draw_rms(runs, cluster, names[:ROWS_MAX]),
     )
@@ -364,7 +364,7 @@ def _cluster_figures(runs: Sequence[ComparedRun], cluster: str) -> Iterator[styl
             yield style.ReportFigure(
                 f"figure_5_errors_{cluster}_{number}.png",
                 f"Formation parameters' errors{numbered(5, paper)}{suffix}",
-                "Runs side by side; each row has one scale, set by the windows (shaded), so larger errors leave it.",
+                "Runs side by side; each row has one scale, set by the windows (shaded); larger errors are cut off.",
                 _draw_errors(some, runs, cluster, names[:ROWS_MAX]),
             )
     for file, number, group_name, group in parameter_groups(names):

@@ -25,9 +25,9 @@ PAPER_PT = 8.0  # text size [pt], that of a paper's captions
 LETTER_EMS, ENTRY_EMS = 0.6, 3.4  # width of a letter, and of a legend entry without its name [em]
 LETTER_PAD_PT = 3.0  # distance between a panel's letter and its axes
 MARK_EMS, LINE_EMS = 0.75, 1.25  # width of a bold letter, and height of a line [em]
-MARK_LINES, MARK_PAD_IN = 4, 0.05  # most lines of a warning's reason, and margin above a warning
+MARK_LINES, MARK_PAD_IN = 4, 0.05  # maximum number of lines of a warning's reason, and margin above a warning
 FONTS: Any = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE does not accept Type 3
-POINTS = 2000  # most points per line: more than a page has pixels across
+POINTS = 2000  # maximum number of points per line: more than a page has pixels across
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, VERMILION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
@@ -155,7 +155,7 @@ def draw_spread(axes: Axes, t_s: Array, values: Array, colour: str) -> None:
     maxima = np.maximum.reduceat(np.nanmax(values, axis=1), starts)
     axes.fill_between(sampled_s, low, high, color=colour, alpha=0.25, lw=0, zorder=2, label="5 to 95 %")
     axes.plot(sampled_s, middle, color=colour, lw=1.0, zorder=3, label="median")
-    axes.plot(sampled_s, minima, color=colour, lw=0.4, alpha=0.7, zorder=2, label="least and greatest")
+    axes.plot(sampled_s, minima, color=colour, lw=0.4, alpha=0.7, zorder=2, label="minimum and maximum")
     axes.plot(sampled_s, maxima, color=colour, lw=0.4, alpha=0.7, zorder=2)
 
 
@@ -199,7 +199,7 @@ def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
 def mark_figure(figure: Figure, heading: str, reason: str, colour: str) -> None:
     """Write a warning about the flight above a complete figure, which grows by the warning's height.
 
-    `head` is the first line; `reason` is wrapped below it, and cut off after MARK_LINES lines.
+    `heading` is the first line; `reason` is wrapped below it, and cut off after MARK_LINES lines.
     """
     width_in, height_in = figure.get_size_inches()
     letters = int(72 * width_in / (MARK_EMS * PAPER_PT))
@@ -290,7 +290,7 @@ def _faults(flight: RecordedFlight) -> Iterator[Band]:
 
 
 def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
-    """Yield when processes other than the scenario's agents flew a drone, from acquisition or first command on."""
+    """Yield the flights of drones by processes other than the scenario's agents, from acquisition or first command."""
     since_ns: dict[str, int] = {}
     planned = {"controller", PILOT, *(flight.scenario.own_agents if flight.scenario else ())}
     for event in flight.events:

@@ -30,16 +30,16 @@ from zsim_analysis.reading.recorded_flight import Array, RadioHistory, RecordedF
 from zsim_analysis.reading.shortfall import span_text
 from zsim_analysis.report import figure_style as style
 
-EACH_MAX = 4  # most drones that get a column each on a page
-PAIRS_MAX = 6  # most pairs of drones that get a line each: those of four drones
-NAMED_MAX = 12  # most drones named in a legend
+EACH_MAX = 4  # maximum number of drones that get a column each on a page
+PAIRS_MAX = 6  # maximum number of pairs of drones that get a line each: those of four drones
+NAMED_MAX = 12  # maximum number of drones named in a legend
 SMALL_PT = style.PAPER_PT - 1.5
 
 # Formations
 
 POSITION = ("x_c", "y_c", "z_c")
 ORIENTATION = ("roll", "pitch", "yaw")
-ROWS_MAX = 16  # most parameters in one figure: those of 4 drones, which fill the height of a page
+ROWS_MAX = 16  # maximum number of parameters in one figure: those of 4 drones, which fill the height of a page
 ROW_IN = 1.0  # height of a parameter's panel, with its letter [in]
 ROWS_IN = 8.4  # maximum height of all rows [in], on a page of 9.25 in
 MOVED_MAX = 3  # number of parameters of a large formation drawn individually
@@ -213,10 +213,10 @@ def curves(formation: Formation, name: str) -> tuple[Array, Array, Array]:
 
 # margin at each end of the plan, as a share of its range, so that marks at its edge are not cut off
 MARGIN_SHARE = 0.06
-OUTLINES = 7  # most outlines of a formation in the plan, few enough to be distinguishable
+OUTLINES = 7  # maximum number of outlines of a formation in the plan, few enough to be distinguishable
 # smallest distance between outlines, as a share of the formation's size; closer ones would overlap
 OUTLINE_DISTANCE_MIN = 0.6
-RING_MAX = 4  # most drones whose outline connects them in order; the outline of more drones is their convex hull
+RING_MAX = 4  # maximum number of drones that their outline connects in order; that of more is their convex hull
 
 
 def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure:
@@ -307,7 +307,7 @@ def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) ->
         if len(p_W) > RING_MAX:
             with suppress(QhullError):  # collinear
                 ring = p_W[ConvexHull(p_W).vertices]
-        name = None if outlines else f"{formation.name}, at times"
+        name = None if outlines else f"{formation.name}, at several times"
         outlines.append(p_W)
         axes.fill(ring[:, 0], ring[:, 1], facecolor="#0000000d", edgecolor=style.DARK, lw=0.7, zorder=4, label=name)
         direction = p_W[0] - centre
@@ -320,7 +320,7 @@ def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) ->
 # Altitude, state and battery
 
 LANES_IN = 5.0  # maximum height of the panel of states, in units of 0.5 in
-LANES_NAMED = 12  # most drones named beside their states
+LANES_NAMED = 12  # maximum number of drones named beside their states
 DRONE_PANELS = ("true altitude (m)", "state", "battery (%)")
 STATES = {
     "landed": style.GREY,
@@ -427,7 +427,7 @@ def draw_estimates(
         _draw_nees(column[-1], each.t_s, each.nees, colours[name])
         notes = [f"{100 * share:.0f} % in {drone_errors.SIGMAS:g}σ" for share in inside]
         notes.append(
-            f"mean {finite_nees.mean():.3g}, of {drone_errors.DEGREES}" if len(finite_nees) else "P is singular"
+            f"mean {finite_nees.mean():.3g}, ideal {drone_errors.DEGREES}" if len(finite_nees) else "P is singular"
         )
         column[0].set_title(name, loc="left", fontsize=style.PAPER_PT)
         for axes, note in zip(column, notes, strict=True):  # above the axes, where it covers no data
@@ -507,7 +507,7 @@ def _draw_many_estimates(
     style.dress(lower, f"x, y, z in {drone_errors.SIGMAS:g}σ (%)")
     lower.scatter(numbers, 100 * inside, clip_on=False, **look)
     lower.axhline(
-        100 * INSIDE, color=style.BLACK, lw=0.7, ls="--", label=f"share of a normal error in {drone_errors.SIGMAS:g}σ"
+        100 * INSIDE, color=style.BLACK, lw=0.7, ls="--", label=f"share of a Gaussian error in {drone_errors.SIGMAS:g}σ"
     )
     lower.set_ylim(top=101)
     lower.set_xlabel("drone, in the order of the scenario", fontsize=style.PAPER_PT)
@@ -615,7 +615,7 @@ def draw_distances(
     axes.set_ylim(bottom=0)
     style.draw_marks([axes], marks)
     for distance_m, name, colour, dashes in (
-        (separations.margin_m, "guard parts", style.AMBER, "--"),
+        (separations.margin_m, "guard acts", style.AMBER, "--"),
         (separations.alarm_m, "alarm", style.VERMILION, "-."),
         (separations.touch_m, "hulls touch", style.VERMILION, "-"),
     ):
@@ -630,7 +630,7 @@ def draw_distances(
 
 # Radio
 
-CELLS_MAX = 6  # most drones for which cells have room for a number
+CELLS_MAX = 6  # maximum number of drones for which cells have room for a number
 DARK_SHARE = 0.6  # share above which a cell is dark and its number white
 
 

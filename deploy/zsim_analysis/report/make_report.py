@@ -135,7 +135,7 @@ def planned_figures(
         yield PlannedFigure(
             "distances.png",
             "Distances between drones",
-            f"True distance of {pairing}; below the upper line the controller's separation guard acts.",
+            f"True distance of {pairing}; lines: the controllers' guard and alarm, and contact of two hulls.",
             partial(draw_distances, separation, separations(flight), colours, marks),
         )
     if tracking_errors := reference_errors(flight):
@@ -169,7 +169,8 @@ def planned_figures(
             "Estimate − truth with the band of two standard deviations that the estimator states, and the NEES, the "
             "squared error of position and velocity normalised by its covariance, which is 6 on average for a "
             "consistent estimator. Shares and means above the panels are those of the window; the axes cover all "
-            "errors since the engagement, so earlier, larger ones leave them.",
+            "errors since the engagement, so larger ones before it may be cut off. For many drones: the spread of the "
+            "position errors, the mean NEES, and statistics of each drone.",
             partial(draw_estimates, errors, colours, window_s, marks),
         )
     if responses := velocity_responses(flight):
@@ -391,7 +392,7 @@ def _put_in_place(directory: Path, report: Path, figures: Path) -> Iterator[Path
             through which files elsewhere would be written and removed.
     """
     if figures.is_symlink():
-        raise ReportError(f"{figures}: is a symbolic link to {figures.readlink()}; must be a folder, remove the link")
+        raise ReportError(f"{figures}: is a symbolic link to {figures.readlink()}; must be a folder; remove the link")
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=directory, prefix=".report-") as folder:

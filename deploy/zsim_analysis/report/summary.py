@@ -45,7 +45,7 @@ from zsim_analysis.reading.shortfall import (
 )
 
 STATISTICS = {"est. std": "est_std", "true std": "true_std", "true RMS": "true_rms", "true mean": "true_mean"}
-EVENTS_PER_KIND = 100  # most events of a kind, so that many refusals do not crowd out a restart
+EVENTS_PER_KIND = 100  # maximum number of events of a kind, so that many refusals do not crowd out a restart
 EVENTS_MAX = 1000
 
 
@@ -85,7 +85,7 @@ class RecordFacts(Struct, frozen=True):
     messages: int
     complete: bool  # neither a message of the world nor the end of the run is missing
     state: str  # the same in words, with what is missing
-    gates: int  # number of gates on record
+    gates: int  # number of gates in the record
     gates_missing: int  # according to the clocks
     gaps: list[dict[str, float]]  # stretches of missing gates: number of gates, time of the first and the last
     messages_missing: int  # messages of the world that are missing according to sequence numbers
@@ -178,7 +178,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
     ended = str(end.get("reason", "ended"))
     if not flight.end:  # a record without an end event does not show which process died
         end_text, is_cut = f"{flight.last_ns / 1e9:.2f} s", not flight.completeness.closed
-        ended = f"the record {'was cut after' if is_cut else 'ends here at'} {end_text}: no end is on record"
+        ended = f"the record {'was cut after' if is_cut else 'ends at'} {end_text}: it has no end event"
     lines: list[EventLine] = []
     kept_counts, omitted = Counter[str](), Counter[str]()
     for event in flight.events:
@@ -278,17 +278,17 @@ def _notes(
     if not flight.completeness.complete:
         yield f"The record is {flight.completeness}."
     if flight.undecoded:
-        yield f"{flight.undecoded} messages on record do not match the type of their key and were skipped."
+        yield f"{flight.undecoded} messages in the record do not match the type of their key and were skipped."
     if flight.info is None:
-        yield "world/info is not on record: scenario, seed and the order of the drones are not known."
+        yield "The record has no world/info: scenario, seed and the order of the drones are not known."
     elif flight.scenario is None:
-        yield "The scenario on record cannot be read by this version."
+        yield "The recorded scenario cannot be read by this version."
     if record.truth_missing:
         expected = record.truth_missing + record.truth_instants
-        yield f"{record.truth_missing} of {expected} truth messages are not on record."
+        yield f"{record.truth_missing} of {expected} truth messages are not in the record."
     reported = (flight.end or {}).get("truth_sha256")
     if reported and reported != record.truth_sha256:
-        yield f"The truth on record has the hash {record.truth_sha256}, the world reported {reported}."
+        yield f"The recorded truth has the hash {record.truth_sha256}, but the world reported {reported}."
     if note:
         yield note
     judged = {formation.name for formation in formations}
@@ -330,7 +330,7 @@ GROUP_COLUMNS = {
     "worst": (Column("worst", worth=3, right=True), ""),
     "of": (Column("of", "name"), ""),
 }
-SINGLY_MAX = 24  # most parameters with a row each, those of 6 drones; more are shown in groups
+SINGLY_MAX = 24  # maximum number of parameters with a row each, those of 6 drones; more are shown in groups
 FRAME = {"x_c": "position", "y_c": "position", "z_c": "position"} | dict.fromkeys(("roll", "pitch", "yaw"), "attitude")
 
 
@@ -480,7 +480,7 @@ def paper_table(scenario: Scenario, cluster: str) -> Mapping[str, float]:
     own, window_s = cluster_of(scenario, cluster), scenario.report.window_s
     if own is None or window_s is None or own.plan.takeoff_s is None:
         return {}
-    # the window lies within the run, after the formation has settled, and is as long as the paper's
+    # the window lies within the run, after the formation has settled, and is at least as long as the paper's
     start, end = window_s
     over_s = min(scenario.duration_s, scenario.duration_s if own.plan.land_s is None else own.plan.land_s)
     is_judged = start >= own.plan.takeoff_s + SETTLED_S and end - start >= JUDGED_S and end <= over_s

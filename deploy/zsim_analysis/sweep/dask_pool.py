@@ -104,7 +104,7 @@ class DaskPool:
                         try:
                             row = future.result()
                         except KilledWorker:
-                            row = failed_row(task, "several workers died in it, see Dask's allowed-failures")
+                            row = failed_row(task, "several workers died in it; see Dask's allowed-failures")
                         except CancelledError:
                             raise
                         except Exception as error:  # raised by `fly` if every further run would fail as well
@@ -131,7 +131,7 @@ class DaskPool:
         self._say(f"{len(versions)} Dask worker{'s'[: len(versions) != 1]} at {self._address}")
 
     def _fill(self, flying: Any, pending: dict[Any, Task], tasks: Iterator[Task]) -> None:
-        """Submit tasks up to AHEAD per thread of the cluster; new workers may join at any time."""
+        """Submit tasks up to TASKS_PER_THREAD per thread of the cluster; new workers may join at any time."""
         while len(pending) < TASKS_PER_THREAD * sum(self._client.nthreads().values()):
             task = next(tasks, None)
             if task is None:

@@ -33,7 +33,7 @@ PLAN = "plan.json"
 METRICS = "report.metrics"  # field that names the user's functions for metrics of a run
 RUNS_MAX = 1_000_000
 SEED = "seed"
-SHOWN_MAX = 24  # most characters of a value in a table or figure
+SHOWN_MAX = 24  # maximum number of characters of a value in a table or figure
 SEEDS = 2**32  # drawn seeds are below this: at most ten digits
 SYNTAX = "seed, seed=paired, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std)"
 PAIRED = "paired"
@@ -182,7 +182,7 @@ def parse(text: str, document: Mapping[str, Any] = NOTHING) -> Axis:
         raise ValueError(f"has {kind}({arguments[:40]}); must hold two numbers") from None
     span = second - first if kind == "uniform" else second
     if not (math.isfinite(first) and math.isfinite(second) and 0 < span < math.inf):
-        need = "low < high, high - low finite too" if kind == "uniform" else "std > 0"
+        need = "low < high and a finite difference" if kind == "uniform" else "std > 0"
         raise ValueError(f"has {kind}({arguments[:40]}); must be finite numbers with {need}")
     return Draw(path, kind, first, second)
 
@@ -279,7 +279,7 @@ class SweepDesign:
 
     @property
     def seed(self) -> int:
-        """The scenario's seed, with which seeds and values are drawn; the default seed if it is invalid."""
+        """The scenario's seed, with which seeds and values are drawn; the default seed if it is missing or invalid."""
         seed = self.plan.document.get(SEED)
         return seed if isinstance(seed, int) and seed >= 0 else _DEFAULT_SEED
 

@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.live import Live
 
 from zsim.errors import OTHER_OUT, ReportError, RunError, file_fault, printable
-from zsim.output_folder import RECORD, held_folder, no_locks
+from zsim.output_folder import RECORD, locked_folder, no_locks
 from zsim.runtime.progress import NotebookLine, cell
 from zsim.runtime.rate_limit import RateLimit
 from zsim.schema import plugin
@@ -62,7 +62,8 @@ def sweep(request: SweepRequest) -> list[Row]:
     """Fly the runs that are missing from the folder; return the rows of all finished runs.
 
     Raises:
-        RunError: the folder holds something else or cannot be written, or workers cannot start.
+        RunError: the folder holds something else, is in use or cannot be written, or workers cannot start.
+        ReportError: the table cannot be read or written.
         KeyboardInterrupt: on Ctrl-C, with the finished runs in the table.
     """
     plan = request.plan
@@ -256,7 +257,7 @@ def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFo
     with file_fault(path, "cannot be made", OTHER_OUT):
         if not is_sweep(path) and ((path / RECORD).exists() or (path / TABLE).exists()):
             raise RunError(f"{path}: holds another run or sweep; {OTHER_OUT}")
-    with held_folder(path, PLAN, (LOCK, NEW_PLAN), force, "sweep into", "another sweep is running"):
+    with locked_folder(path, PLAN, (LOCK, NEW_PLAN), force, "sweep into", "another sweep is running"):
         if warning := no_locks(path):
             print(printable(warning), file=sys.stderr)
         _write_plan(path, plan)

@@ -90,8 +90,8 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
     yield style.ReportFigure(
         "safety.png",
         "How the runs ended, and how close the drones came to each other",
-        "(a) Share of runs that ended well and, of these, shares flown as planned and without a collision, "
-        f"with exact intervals. (b) Minimum true distance between two drones in the air.{hint}",
+        "(a) Share of runs that ended well and, of these, shares flown as planned and without a collision "
+        f"or crash, with exact intervals. (b) Minimum true distance between two drones in the air.{hint}",
         _draw_safety(results),
     )
     for i, path in enumerate(results.drawn if own or rms else ()):

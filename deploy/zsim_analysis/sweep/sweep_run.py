@@ -244,7 +244,7 @@ def _record(task: Task) -> Iterator[RecordWriter | None]:
         for module in generated_modules(task.scenario.own_code(), plugin.folders()):
             copy(module, part)
     except OSError as error:
-        reason = f"cannot be written ({error.strerror}); free some space; the same command then continues"
+        reason = f"cannot be written ({error.strerror}); remove the cause; the same command then continues"
         raise RecordError(f"{part}: {reason}") from error
     writer = RecordWriter(part / "run.mcap")
     try:

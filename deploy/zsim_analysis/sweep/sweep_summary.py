@@ -25,7 +25,7 @@ from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, engaged_column
 Samples = NDArray[np.float64]
 
 LEVEL = 0.95  # confidence level of all intervals
-RUNS_MIN = 5  # minimum number of runs for an interval; design choice: that of 2 runs is 13 times their difference
+RUNS_MIN = 5  # minimum number of runs for an interval; design choice: with 2, it is 13 times their difference
 SEPARATION = "min_separation_m"
 OBSTACLE_DISTANCE = "min_obstacle_distance_m"
 _NUMBER = re.compile(r"(?<![\w.])\d[\d.]*")  # a number in a text, but not in a name such as drone1
@@ -43,7 +43,7 @@ class ConfidenceInterval(Struct, frozen=True):
 def mean_interval(samples: Samples) -> ConfidenceInterval:
     """Return the mean of samples (n,) with Student's interval, mean ± t(n − 1) s / √n; NaN limits if n < RUNS_MIN.
 
-    The interval is exact for normal samples, and asymptotically correct for others by the central limit theorem.
+    The interval is exact for normally distributed samples, and for others asymptotically (central limit theorem).
     """
     n = len(samples)
     middle = float(np.mean(samples)) if n else math.nan
@@ -54,7 +54,7 @@ def mean_interval(samples: Samples) -> ConfidenceInterval:
 
 
 def share_interval(count: int, total: int) -> ConfidenceInterval:
-    """Return count / of with the exact interval of Clopper and Pearson (Biometrika 26, 1934); of > 0.
+    """Return count / total with the exact interval of Clopper and Pearson (Biometrika 26, 1934); total > 0.
 
     The coverage is at least LEVEL for every share and number of runs.
     """
@@ -266,7 +266,7 @@ class SweepResults:
         points = []
         for point in range(self.design.points):
             (well, runs), (planned, judged_count) = self.ended_well(point), self.count("as_planned", point)
-            if runs and not planned and (judged_count or not well):  # runs without a cluster are not judged
+            if runs and not planned and (judged_count or not well):  # a run without a verdict counts neither way
                 points.append(point)
         return points
 
@@ -359,7 +359,7 @@ WORDS = {
 }  # fmt: skip
 VARIABLE_SECTIONS = ("target", "values", "expressions")  # maps in a plan, keyed by the variables of its cluster
 CLASS_SECTIONS = ("parameters", "law_parameters", "space_parameters")  # likewise omitted from field names
-_STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.overrides
+_STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.scenario_file
 
 
 class FieldName(Struct, frozen=True):

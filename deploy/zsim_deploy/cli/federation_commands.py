@@ -113,11 +113,11 @@ def pub(
 @observer_options
 def ask(
     reach: WorldAccess,
-    key: Annotated[str, Argument(help="world/control or cluster/NAME/control.")],
+    key: Annotated[str, Argument(help="world/control, cluster/NAME/control or drone/NAME/control.")],
     op: Annotated[str, Argument(help="Operation, e.g. pause, resume, step, stop; engage, hold, land, target.")],
     args: Annotated[str, Argument(help="Arguments as a JSON object, e.g. '{\"gates\": 50}'.")] = "{}",
 ) -> None:
-    """Send a request to the world or a controller, and print the answer. Exit code 1 if it is refused."""
+    """Send a request to the world, a controller or a pilot, and print the answer. Exit code 1 if it is refused."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):

@@ -132,10 +132,10 @@ def older_processor() -> dict[str, str]:
 def _check_processor(scenario: Path, duration_s: float) -> str:
     """Fly the start of a scenario as on two processors; return where the flights first differ, empty if nowhere.
 
-    The scenario is flown normally; its record is then rerun with the code of the C library, BLAS and numpy for a
-    processor of 2008 without fused operations. zsim's own code gives the same results with both. A difference comes
-    from a user's class that calls functions whose results depend on the processor: np.linalg or `@`, np.exp on arrays,
-    math.sin. Raise RunError if the scenario cannot be flown in one process.
+    The scenario is flown normally; its record is then rerun with the code of the C library, BLAS and numpy for an older
+    processor: on x86, one of 2008 without fused operations. zsim's own code gives the same results with both. A
+    difference comes from a user's class that calls functions whose results depend on the processor: np.linalg or `@`,
+    np.exp on arrays, math.sin. Raise RunError if the scenario cannot be flown in one process.
     """
     with tempfile.TemporaryDirectory(prefix="zsim-doctor-") as folder:
         out = str(Path(folder, "run"))
@@ -222,7 +222,7 @@ def ps(
     federation: Annotated[str, Option(help="Only runs of this federation.")] = ALL_FEDERATIONS,
     as_json: Annotated[bool, Option("--json", help="Print JSON, one line per run.")] = False,
 ) -> None:
-    """Show the processes of the runs on this machine: role, host, pid, state, lag, age, messages/s, restarts.
+    """Show the processes of runs on this machine: role, host, pid, state, lag, age, messages/s, round trip, restarts.
 
     A narrow terminal shows fewer columns; --json prints all of them.
     """
@@ -324,7 +324,7 @@ def init(
         bool, Option("--force", help="Make a new authority; earlier certificates become invalid.")
     ] = False,
 ) -> None:
-    """Make the missing certificates, their authority, and access control for the world and the routers."""
+    """Make certificates that are missing or invalid, their authority, and access control for world and routers."""
     from zsim_deploy import certificates, inventory
 
     inventory_file, now = inventory.load(hosts), datetime.now(UTC)

@@ -72,7 +72,7 @@ def echo(
 
 
 def keys_like(link: Session, expression: str) -> str:
-    """Return the end of a message about a key without a publisher: similar keys that are in use."""
+    """Return the end of a message about a key without a publisher: similar keys in use, or how to list those in use."""
     in_use = [key for key, _, _ in list_keys(link, "**")]
     names = ", ".join(get_close_matches(expression, in_use, NAMED_MAX))
     return f"; similar keys in use: {names}" if names else "; `zsim keys` lists the keys in use"

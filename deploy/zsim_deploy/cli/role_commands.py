@@ -63,7 +63,7 @@ RequestedPace = Annotated[
 SigningKey = Annotated[
     Path | None, Option(help="File with the key for MAVLink 2 signatures; unsigned messages are refused.")
 ]
-DroneName = Annotated[str, Argument(help="Drone of the run that it flies as, with `body: external` in the scenario.")]
+DroneName = Annotated[str, Argument(help="Drone that the vehicle flies as, with `body: external` in the scenario.")]
 Armed = Annotated[
     bool, Option("--armed", help="Accept commands from the start; otherwise an operator must first request `arm`.")
 ]
@@ -252,7 +252,7 @@ def serve_as(
     lowered: bool = False,
     remain: "Remain | None" = None,
 ) -> None:
-    """Serve one run after another, as the process that `process_name` names.
+    """Serve one run after another, or only one if launched, as the process that `process_name` names.
 
     `lowered`: run at a lower priority than the processes that the world waits for; `remain`: called after a
     launched run.
@@ -559,7 +559,7 @@ def drive_mavlink(
     ] = 0,
     signing_key: SigningKey = None,
     origin: Annotated[
-        str | None, Option(help="Origin of its local frame, X,Y,Z m in W (default: as reported).")
+        str | None, Option(help="Origin of the vehicle's local frame, X,Y,Z m in W (default: as reported).")
     ] = None,
 ) -> None:
     """Fly a MAVLink vehicle (PX4, ArduPilot, or a simulator of one) as a drone of the run."""
@@ -626,7 +626,7 @@ def fmu(
         float | None,
         Option(
             callback=opt.not_negative,
-            help="Time at which it has the drones that it commands take off, s (default: it does not).",
+            help="Time at which the FMU has the drones that it commands take off, s (default: never).",
         ),
     ] = None,
     frame: Annotated[Literal["heading", "world"], Option(help="Frame of velocity commands.")] = "heading",

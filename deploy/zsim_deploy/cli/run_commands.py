@@ -140,7 +140,7 @@ def _given(context: typer.Context, options: Sequence[str]) -> str:
 
 
 def conclude(outcome: Any, out: Path, report: bool) -> None:
-    """Print how a run ended, make its report, and exit with the matching code."""
+    """Print how a run ended, make its report if `report`, and exit with the matching code."""
     record, fault = out / "run.mcap", "nothing was recorded"
     if outcome.interrupted:
         note(f"ended: {outcome.reason}")
@@ -163,7 +163,7 @@ def conclude(outcome: Any, out: Path, report: bool) -> None:
                 raise
             note(str(error))
         except KeyboardInterrupt:
-            note(f"interrupted; the record is kept, `zsim report {out}` makes its report")
+            note(f"interrupted; the record is kept; `zsim report {out}` makes its report")
             sys.exit(INTERRUPTED)
         say(f"ended: {outcome.reason}; the record is {record}")
     if fault := outcome.reason if outcome.failed else fault:
@@ -187,7 +187,7 @@ def note_skipped(names: Sequence[str]) -> None:
 
 @app.command(rich_help_panel=opt.RUN)
 def validate(scenario: opt.ScenarioPath, set_: opt.Set = None, trust: opt.Trust = False) -> None:
-    """Check a scenario and print it resolved, with one line per fault. The code that it names is not run."""
+    """Check a scenario; print it resolved, or one line per fault. The code that it names is run only with --trust."""
     from zsim.scenario import scenario_file
     from zsim.scenario.consistency import unflown_plans
     from zsim.schema import plugin
@@ -311,7 +311,7 @@ def sweep(
     try:
         rows = fly_plan(plan, folder, workers, dask, force)
     except KeyboardInterrupt:
-        note(f"interrupted; the same command with --out {folder} continues; the table so far is in it")
+        note(f"interrupted; the same command with --out {folder} continues the sweep; its table so far is there")
         sys.exit(INTERRUPTED)
     failures = [row["failure"] for row in rows if row["failure"]]
     shortfall_texts = [row["shortfall"] for row in rows if row.get("shortfall") and not row["failure"]]
@@ -451,7 +451,7 @@ def bundle(
     with plugin.names_only(not trust) as skipped, working("reading the record …"):
         written = make_bundle(run, out, not no_record, force, note)
     for name in skipped:
-        note(f"note: {name} was found but not imported; --trust imports it, for the errors in its figures")
+        note(f"note: {name} was found but not imported; --trust imports it, so that the bundle's figures show errors")
     say(f"{written.path}: {written.size_bytes / 1e6:.1f} MB, SHA-256 {written.sha256}")
 
 

@@ -98,7 +98,7 @@ class ControlSocket:
     """The launcher's end of the control socket; a context manager.
 
     Args:
-        acts: function for each `op`; called in a thread with the request's arguments, it returns a JSON value.
+        actions: function for each `op`; called in a thread with the request's arguments, it returns a JSON value.
 
     Raises:
         RunError: another launcher of the federation runs here, or no socket can be opened.

@@ -1,6 +1,6 @@
 """`zsim doctor`: checks whether the hosts of an inventory can fly together, without starting a run.
 
-`zsim up` makes the same checks, and also checks whether the ports of the run are free.
+`zsim up` makes the same checks, but instead of measuring network paths it checks whether the ports are free.
 """
 
 import asyncio

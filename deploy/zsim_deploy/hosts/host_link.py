@@ -135,7 +135,7 @@ class HostLink:
                 done = await asyncio.wait_for(connection.run(command, input=stdin, encoding=None), timeout_s)
             except TimeoutError as error:
                 description = what or repr(command[:60])
-                raise HostsError(f"{self.name}: no answer within {timeout_s:g} s to {description}") from error
+                raise HostsError(f"{self.name}: no answer within {timeout_s:g} s ({description})") from error
             except (asyncssh.Error, OSError) as error:
                 raise _broken(self.name, error) from error
         if done.exit_status != 0:
@@ -258,7 +258,7 @@ class ProgramEndedError(HostsError):
     """A program on a host ended without an answer; `status`: its exit code; `last`: its last line on standard error."""
 
     def __init__(self, name: str, status: int | None, last: str) -> None:
-        super().__init__(f"{name}: it ended with code {status} ({last or 'it printed nothing'})")
+        super().__init__(f"{name}: the program ended with code {status} ({last or 'it printed nothing'})")
         self.status, self.last = status, last
 
 
@@ -323,7 +323,7 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
             try:
                 while not (await asyncio.wait([copy], timeout=STALL_S))[0]:
                     if not moved.is_set():
-                        raise HostsError(f"no data for {STALL_S:g} s; what was received is {part}")
+                        raise HostsError(f"no data for {STALL_S:g} s; what was received is in {part}")
                     moved.clear()
             finally:
                 copy.cancel()
@@ -384,7 +384,7 @@ async def connect(name: str, host: Host, base: Path) -> Connection:
     """Connect to a host; ~/.ssh/config fills in what its inventory entry leaves out.
 
     Relative paths of `key` and `known_hosts` refer to `base`, the folder of the inventory. Raise HostsError if the host
-    cannot be reached, shows a host key other than that in known_hosts, or refuses the user or key.
+    cannot be reached, shows a host key that is not in known_hosts, or refuses the user or key.
     """
     client, address = _Client(), host.ssh or host.address
     options: dict[str, Any] = {"keepalive_interval": KEEPALIVE_S, "keepalive_count_max": KEEPALIVE_COUNT}

@@ -92,8 +92,8 @@ class HostRun:
     def run(self) -> Outcome:
         """Fly the run to its end; however it ends, no process or key of the run is left on a host that can be reached.
 
-        Raise RunError if the federation already runs on this machine, and HostsError with a line for every missing
-        certificate and every host that cannot take part.
+        Raise RunError if the federation already runs on this machine, and HostsError with a line for every fault of the
+        certificates, or else for every host that cannot take part.
         """
         requests = {
             "ps": lambda: {"rows": self._status.rows(), "clock": self._status.clock_now, **self._where()},
@@ -250,7 +250,7 @@ class HostRun:
 
     def _refuse_unless_runs(self, role: str) -> None:
         if not self._supervisor.members:
-            raise RunError("the run has not started yet; try again when it flies")
+            raise RunError("the run has not started yet; try again later")
         if role not in self._plan.processes:
             raise RunError(f"role is {role!r}; must be one of {', '.join(self._plan.processes)}")
 
@@ -308,7 +308,7 @@ async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
 
 
 class HostPlan:
-    """The processes that zsim starts in a run, and their hosts; immutable. Raises InventoryError if one has none."""
+    """The processes that zsim starts in a run, and their hosts; immutable. Raises InventoryError if any has no host."""
 
     def __init__(
         self, inventory_file: InventoryFile, scenario: Scenario, run_id: str, pace: Sequence[str] = ()

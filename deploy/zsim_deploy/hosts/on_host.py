@@ -49,7 +49,7 @@ def inspect_folder(folder: Path) -> dict:
 
 
 def _installed(environment: Path) -> dict | None:
-    """Return the note of an earlier push; None if its environment has a Python other than the running one."""
+    """Return the note of an earlier push; None if there is none, or the environment has a Python unlike this one."""
     if not os.access(environment / "bin" / "python", os.X_OK):
         return None
     with contextlib.suppress(OSError, ValueError):

@@ -81,7 +81,7 @@ def governors(folder: Path) -> list[str]:
 
 
 def serve(port: int) -> None:
-    """Confirm transfers on a port until standard input ends; first print that the port is ready, or why it is not."""
+    """Print whether a port is ready; then confirm transfers until standard input ends or none arrives for SERVE_S."""
     try:
         server = listening(port)
     except OSError as error:

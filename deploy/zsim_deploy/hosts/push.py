@@ -244,7 +244,7 @@ class Installer:
 async def open_installer(
     link: HostLink, python: str, folder: str, progress: Callable[[str], None]
 ) -> AsyncIterator[Installer]:
-    """Run on_host.py with a Python of a host for the duration of the block, after any other push to it has ended.
+    """Run on_host.py with a Python of a host for the duration of the block, after any other push there has ended.
 
     `folder`: zsim's folder on the host; `progress` takes a line about a push that is awaited. Raise HostsError if the
     host cannot be reached, its folder cannot be used, or the other push takes too long.

@@ -190,8 +190,8 @@ class Wheelhouse:
             except PipError as error:
                 line = f"no wheels for {target}: {error}"
                 if match := re.search(r"satisfies the requirement ([\w.-]+)", str(error)):
-                    remedy = "use another Python there, or build it there and give pip here its folder (PIP_FIND_LINKS)"
-                    line = f"no wheel of {match[1]} for {target}; {remedy}"
+                    remedy = "use another Python there, or build that wheel there, copy it to this machine,"
+                    line = f"no wheel of {match[1]} for {target}; {remedy} and set PIP_FIND_LINKS to its folder"
                 raise HostsError(f"{host}: {line}") from error
             names = sorted(path.name for path in Path(temporary).glob("*.whl") if path.name != project.name)
             for name in names:
@@ -275,7 +275,7 @@ def default_cache() -> Path:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"
     except RuntimeError as error:  # HOME is not set, and the system does not know the user
         reason = "this user has no home folder for the cache; set XDG_CACHE_HOME to a folder"
-        raise HostsError(f"push: {reason}") from error
+        raise HostsError(f"launcher: {reason}") from error
 
 
 # Running pip

@@ -311,7 +311,7 @@ class ProgramProcess:
     """A user's program, as a `RunProcess`; its output goes to the log NAME.log.
 
     Args:
-        words: the command line.
+        command: the command line.
         folder: working folder; None: the current one.
     """
 

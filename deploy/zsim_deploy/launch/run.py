@@ -156,7 +156,7 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
         commands[names[-1]] = ["host", *connection_options, "--", *names]
     else:
         for role, _, thing in (name.partition(".") for name in names):
-            name = f"{role}.{thing}"  # preceded by -- below, because it may begin with -
+            name = f"{role}.{thing}"  # options end with -- below, because a thing may begin with -
             commands[name] = (
                 ["agent", *connection_options, "--", name]
                 if role in scenario.own_agents

@@ -101,7 +101,7 @@ class Supervisor:
         self._silent_s: float | None = None  # monotonic time at which a world without any output is reported
         self._dead: set[str] = set()
         self._lost: dict[str, int | None] = {}  # pid of each process that ended without a bye message, by name
-        self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and when (monotonic, s)
+        self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and when they were (monotonic, s)
         self._left: list[RunProcess] = []  # replaced processes that have ended or were killed
         self._world_watch = WorldWatch()
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
@@ -225,7 +225,7 @@ class Supervisor:
             if self._silent_s is not None and time.monotonic() > self._silent_s:
                 self._silent_s = None
                 silent = f"the world (pid {world.pid}) has not begun after {SILENT_S:g} s"
-                self._show.say(f"{silent}: {world.last_log_line() or 'its log is empty'}; the others wait")
+                self._show.say(f"{silent}: {world.last_log_line() or 'its log is empty'}; the other processes wait")
             if line := self._world_watch.change(time.monotonic(), world.pid):
                 self._show.say(line)
             on_poll()

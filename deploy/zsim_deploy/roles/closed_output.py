@@ -29,7 +29,7 @@ class _Output(io.FileIO):
             raise
         except OSError as error:  # such as a full disk or a closed terminal
             if not self._lost and self.fileno() != STREAMS[-1]:
-                write_error(f"standard output cannot be written ({error.strerror}); further output is lost")
+                write_error(f"cannot write to standard output ({error.strerror}); output is lost")
             self._lost = True
             return len(data)
 
@@ -72,7 +72,7 @@ def is_unread(stream: int) -> bool:
 
 
 def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOSED) -> None:
-    """Redirect further output to the file `log`, except from streams that already write to a file."""
+    """Redirect further output, except of streams that write to a file, to the file `log`; drop it if that fails."""
     try:
         into = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     except OSError:
@@ -82,7 +82,7 @@ def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOS
         with contextlib.suppress(OSError):  # the stream is not open at all
             lost += [] if stat.S_ISREG(os.fstat(stream).st_mode) else [stream]
     if lost:
-        write_error(f"{why}; further output is in {log}")
+        write_error(f"{why}; further output goes to {log} if it can be written")
     for stream in lost:
         os.dup2(into, stream)
     os.close(into)

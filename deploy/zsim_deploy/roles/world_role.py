@@ -54,7 +54,7 @@ def world(
     Raises:
         RunError: the journal belongs to another run.
         SessionError: an endpoint is in use, or the identity cannot be used.
-        RunFailedError: a process left early.
+        RunFailedError: a process left early, and no launcher started the world.
     """
     from zsim.math.compiled import is_kept
     from zsim_world.fleet.kernel import advance

@@ -68,7 +68,7 @@ from zsim_world.physics.simd import body_blocks
 from zsim_world.physics.surfaces import BALLS, PLANE, POINTS, SLOTS_MAX, contact_points, obstacle_rows
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.noise import NoiseTable
-from zsim_world.sensors.sampler import Sampled, Sampler, with_more
+from zsim_world.sensors.sampler import Sampled, Sampler, insert_rows
 from zsim_world.sensors.scans import Scan, ScanSampler
 from zsim_world.sensors.sensor_set import SONAR_COSINE_MIN, FleetSensors, fleet_sensors
 from zsim_world.sensors.sightings import PictureSightings, SightingSampler
@@ -233,7 +233,7 @@ class Fleet:
         number = {name: len(self.sensors.names) + k for k, name in enumerate(self.extra_sensors)}
         observations.sort(key=lambda each: (each.t_ns, each.drone, number[each.sensor], each.t_sample_ns, each.camera))
         rows = [(number[each.sensor], each.drone, each.t_ns, each.t_sample_ns) for each in observations]
-        whose, values, indices = with_more(*self.sampled, np.array(rows, dtype=np.int64))
+        whose, values, indices = insert_rows(*self.sampled, np.array(rows, dtype=np.int64))
         self.sampled = Sampled(whose, values)
         self.observations = dict(zip(indices.tolist(), observations, strict=True))
 

@@ -15,7 +15,7 @@ from zsim.math.rotation import norm
 from zsim.scenario.surroundings import Sheet
 from zsim_world.fleet.flight_watch import watch
 from zsim_world.physics import rigid_body as body
-from zsim_world.physics.contacts import WIND, blow, meet_drones
+from zsim_world.physics.contacts import WIND, advance_gust, meet_drones
 from zsim_world.physics.fleet_arrays import (
     CLOCK,
     EXPOSED,
@@ -61,7 +61,7 @@ def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: NoiseRows) -> No
     at = noise.at[STREAMS.wind] + 3 * noise.cursor[count, STREAMS.wind]
     common, wind_row = vector(noise.table[count], at), vector(wind, 0) + four(wind, 3)
     for i in range(count):
-        blow(wind_row, vector(state[i], STATE.v_WB), gust[i], common, vector(noise.table[i], at), STEP_S)
+        advance_gust(wind_row, vector(state[i], STATE.v_WB), gust[i], common, vector(noise.table[i], at), STEP_S)
     for i in range(count + 1):
         noise.cursor[i, STREAMS.wind] += 1
 

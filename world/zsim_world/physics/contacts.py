@@ -44,7 +44,7 @@ def gust_noise(correlation: float, common: float, own: float) -> float:
 
 
 @inlined
-def blow(wind: Row, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt: float) -> None:
+def advance_gust(wind: Row, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt: float) -> None:
     """Advance the gust (3,) [m/s] at one drone by dt, in place, by exact discretisation of the filter.
 
     Args:
@@ -114,7 +114,7 @@ def _displacement(state: NDArray, i: int, j: int) -> Vector:
 
 
 @inlined
-def _blow(bodies: Bodies, above: int, below: int, aside: float, drop: float) -> None:
+def _add_downwash(bodies: Bodies, above: int, below: int, aside: float, drop: float) -> None:
     row, state = bodies.vehicle[above], bodies.state[above]
     thrust = free_thrust(row, PerRotor(state, STATE.size, 1, bodies.each)) * z_axis(four(state, STATE.q_WB))[2]
     bodies.air[below, 2] -= downwash(thrust, row[VEHICLE.air_density], row[VEHICLE.jet_start], drop, aside)
@@ -181,7 +181,7 @@ def _meet(bodies: Bodies, i: int, j: int) -> float:
     above = j if dz > 0.0 else i
     reach = jet_reach(vehicle[above, VEHICLE.jet_start], abs(dz))
     if aside2 < reach * reach:
-        _blow(bodies, above, i + j - above, math.sqrt(aside2), abs(dz))
+        _add_downwash(bodies, above, i + j - above, math.sqrt(aside2), abs(dz))
     return square
 
 

@@ -219,7 +219,7 @@ def state_arrays(group: tuple[object, ...]) -> Iterator[NDArray]:
 
 
 class PerRotor(NamedTuple):
-    """One drone's groups of numbers per rotor, in a row or in a block of drones; read by `of`."""
+    """One drone's groups of numbers per rotor, in a row or in a block of drones; read by `value_of`."""
 
     numbers: NDArray
     first: int
@@ -255,17 +255,17 @@ def put_four(row: NDArray, at: int, a: Quaternion) -> None:
 
 
 @inlined
-def of(rotors: PerRotor, group: int, r: int) -> float:
+def value_of(rotors: PerRotor, group: int, r: int) -> float:
     """Return the value for rotor r in a group."""
     return rotors.numbers[rotors.first + rotors.step * (group * len(rotors.each) + r)]
 
 
 @inlined
-def place(rotors: PerRotor, r: int) -> tuple[float, float, float]:
+def rotor_layout(rotors: PerRotor, r: int) -> tuple[float, float, float]:
     """Return x, y [rotor_unit] and turn of rotor r, from the drone's rotor parameters."""
     if len(rotors.each) == CROSS_ROTORS:
         return _X[r], _Y[r], _TURN[r]
-    return of(rotors, ROTOR.x, r), of(rotors, ROTOR.y, r), of(rotors, ROTOR.turn, r)
+    return value_of(rotors, ROTOR.x, r), value_of(rotors, ROTOR.y, r), value_of(rotors, ROTOR.turn, r)
 
 
 @inlined
@@ -273,8 +273,8 @@ def mixed(rotors: PerRotor, r: int) -> tuple[float, float, float, float]:
     """Return the mixer's roll, pitch, yaw and inverse of yaw for rotor r, from the drone's rotor parameters."""
     if len(rotors.each) == CROSS_ROTORS:
         return _ROLL[r], _PITCH[r], _YAW[r], 1.0 / _YAW[r]
-    inverse = of(rotors, ROTOR.yaw_inverse, r)
-    return of(rotors, ROTOR.roll, r), of(rotors, ROTOR.pitch, r), of(rotors, ROTOR.yaw, r), inverse
+    inverse = value_of(rotors, ROTOR.yaw_inverse, r)
+    return value_of(rotors, ROTOR.roll, r), value_of(rotors, ROTOR.pitch, r), value_of(rotors, ROTOR.yaw, r), inverse
 
 
 @inlined
@@ -282,7 +282,7 @@ def lift_share(rotors: PerRotor, r: int) -> float:
     """Return the ratio of rotor r's thrust to the mean, from the drone's rotor parameters."""
     if len(rotors.each) == CROSS_ROTORS:
         return 1.0
-    return of(rotors, ROTOR.lift, r)
+    return value_of(rotors, ROTOR.lift, r)
 
 
 @inlined

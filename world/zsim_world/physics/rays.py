@@ -72,9 +72,9 @@ def inverse(x: float) -> float:
 
 
 @inlined
-def _slab(o: float, per: float, half: float) -> tuple[float, float]:
-    """Return when a ray enters and leaves |x| <= half; `per`: 1 / its speed along x."""
-    a, b = (-half - o) * per, (half - o) * per
+def _slab(o: float, inverse_d: float, half: float) -> tuple[float, float]:
+    """Return when a ray enters and leaves |x| <= half; `inverse_d`: 1 / its speed along x."""
+    a, b = (-half - o) * inverse_d, (half - o) * inverse_d
     return (a, b) if a < b else (b, a)
 
 
@@ -95,7 +95,7 @@ def _quadric(a: float, b: float, c: float) -> tuple[float, float]:
 
 
 @inlined
-def _met(first: float, last: float, far: float) -> float:
+def _entry_distance(first: float, last: float, far: float) -> float:
     """Return where a ray that is in a solid from `first` to `last` enters it: 0 from inside, `far` if not before."""
     if first > last or last < 0.0:
         return far
@@ -110,17 +110,17 @@ def cast_solid(row: NDArray, o: Vector, d: Vector, far: float) -> float:
     if row[SHAPE] == SPHERE:
         along, square = ox * d[0] + oy * d[1] + oz * d[2], ox * ox + oy * oy + oz * oz
         first, last = _quadric(1.0, along, square - radius * radius)
-        return _met(first, last, far)
+        return _entry_distance(first, last, far)
     first, last = _slab(oz, inverse(d[2]), row[HALF + 2])
     if row[SHAPE] == CYLINDER:
         along, square = ox * d[0] + oy * d[1], ox * ox + oy * oy
         enter, leave = _quadric(d[0] * d[0] + d[1] * d[1], along, square - radius * radius)
-        return _met(max(first, enter), min(last, leave), far)
+        return _entry_distance(max(first, enter), min(last, leave), far)
     c, s = row[COSINE], row[SINE]
     enter, leave = _slab(c * ox + s * oy, inverse(c * d[0] + s * d[1]), radius)
     first, last = max(first, enter), min(last, leave)
     enter, leave = _slab(c * oy - s * ox, inverse(c * d[1] - s * d[0]), row[HALF + 1])
-    return _met(max(first, enter), min(last, leave), far)
+    return _entry_distance(max(first, enter), min(last, leave), far)
 
 
 @inlined
@@ -162,15 +162,15 @@ def cast_hull(p_WB: Vector, q_WB: Quaternion, radius: float, o: Vector, d: Vecto
     up = 1.0 / HULL_FLATNESS
     at, to = (at[0], at[1], up * at[2]), (to[0], to[1], up * to[2])
     first, last = _quadric(dot(to, to), dot(at, to), dot(at, at) - radius * radius)
-    return _met(first, last, far)
+    return _entry_distance(first, last, far)
 
 
 @inlined
-def _box(bounds: NDArray, o: Vector, per: Vector, far: float) -> float:
+def _box(bounds: NDArray, o: Vector, inverse_d: Vector, far: float) -> float:
     """Return the distance at which a ray enters a box; `far` or more if not before."""
     first, last = 0.0, far
     for k in range(3):
-        a, b = (bounds[k] - o[k]) * per[k], (bounds[k + 3] - o[k]) * per[k]
+        a, b = (bounds[k] - o[k]) * inverse_d[k], (bounds[k + 3] - o[k]) * inverse_d[k]
         if a > b:
             a, b = b, a
         first = a if a > first else first
@@ -185,8 +185,8 @@ def cast_parts(scene: Scene, o: Vector, d: Vector, far: float) -> float:
     waiting, entered = tree.waiting, tree.away  # boxes to visit, and the distances at which the ray enters them [m]
     if tree.bounds.shape[0] == 0:
         return best
-    per = (inverse(d[0]), inverse(d[1]), inverse(d[2]))
-    node, at, depth = 0, _box(tree.bounds[0], o, per, best), 0
+    inverse_d = (inverse(d[0]), inverse(d[1]), inverse(d[2]))
+    node, at, depth = 0, _box(tree.bounds[0], o, inverse_d, best), 0
     while True:
         while at < best:
             first, parts = tree.link[node, 0], tree.link[node, 1]
@@ -199,7 +199,7 @@ def cast_parts(scene: Scene, o: Vector, d: Vector, far: float) -> float:
                         best = cast_triangle(scene.triangle[m - count], o, d, best)
                 break
             near, other = node + 1, first
-            at, away = _box(tree.bounds[near], o, per, best), _box(tree.bounds[other], o, per, best)
+            at, away = _box(tree.bounds[near], o, inverse_d, best), _box(tree.bounds[other], o, inverse_d, best)
             if away < at:
                 near, other, at, away = other, near, away, at
             if away < best:

@@ -24,11 +24,11 @@ from zsim_world.physics.fleet_arrays import (
     four,
     lift_share,
     mixed,
-    of,
-    place,
     put,
     put_four,
     put_value,
+    rotor_layout,
+    value_of,
     vector,
 )
 from zsim_world.physics.surfaces import Touch, contact, touched
@@ -180,7 +180,7 @@ def step(
 def lag(speeds: PerRotor, commands: PerRotor, decay: float) -> None:
     """Advance rotor speeds [rad/s] in place until the fraction `decay` of their error is left."""
     for r in range(len(speeds.each)):
-        put_value(speeds, r, lagged(of(speeds, 0, r), of(commands, 0, r), decay))
+        put_value(speeds, r, lagged(value_of(speeds, 0, r), value_of(commands, 0, r), decay))
 
 
 @inlined
@@ -295,8 +295,8 @@ def wrench(
     slew = 1.0 / row[VEHICLE.rotor_lag]
     total, mx, my, mz, spin = 0.0, 0.0, 0.0, 0.0, 0.0
     for r in range(len(rotors.each)):
-        x, y, turn = place(rotors, r)
-        speed, command = of(speeds, 0, r), of(commands, 0, r)
+        x, y, turn = rotor_layout(rotors, r)
+        speed, command = value_of(speeds, 0, r), value_of(commands, 0, r)
         if decay is not None:
             speed = lagged(speed, command, decay)
         square = speed * speed
@@ -331,11 +331,11 @@ def in_flow(
     unit, (wx, wy, wz) = row[VEHICLE.rotor_unit], w_WB_B
     fx, fy, fz, mx, my, mz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for r in range(len(rotors.each)):
-        x, y, _ = place(rotors, r)
+        x, y, _ = rotor_layout(rotors, r)
         x, y = x * unit, y * unit
-        speed, low = of(speeds, 0, r), of(rotors, ROTOR.low, r)
+        speed, low = value_of(speeds, 0, r), value_of(rotors, ROTOR.low, r)
         if decay is not None:
-            speed = lagged(speed, of(commands, 0, r), decay)
+            speed = lagged(speed, value_of(commands, 0, r), decay)
         ux, uy, uz = u_B[0] - wz * y, u_B[1] + wz * x, u_B[2] + wx * y - wy * x
         across = -aero[AERO.rotor_drag] * speed
         flying = min(speed * speed / max(low * low, LOW_SQUARE_MIN), 1.0)
@@ -350,7 +350,7 @@ def free_thrust(row: Row, speeds: PerRotor) -> float:
     """Return the thrust [N] far from the ground."""
     squares = 0.0
     for r in range(len(speeds.each)):
-        squares += of(speeds, 0, r) * of(speeds, 0, r)
+        squares += value_of(speeds, 0, r) * value_of(speeds, 0, r)
     return row[VEHICLE.thrust] * squares
 
 
@@ -392,7 +392,7 @@ def power(row: NDArray, speeds: PerRotor) -> float:
     """Return the electric power [W] at given rotor speeds [rad/s]: of the shafts, sum of k_M w^3, and electronics."""
     cubes = 0.0
     for r in range(len(speeds.each)):
-        speed = of(speeds, 0, r)
+        speed = value_of(speeds, 0, r)
         cubes += speed * speed * speed
     return row[VEHICLE.torque] * cubes / row[VEHICLE.efficiency] + row[VEHICLE.electronics]
 

@@ -136,7 +136,7 @@ def move(bodies: Bodies, dt: float) -> None:
             for k in range(LANES):
                 lanes[LANES * BODY_LANES.clear + k] = 0.0
         for i in range(first, min(first + LANES, count)):
-            _take_over(bodies, lanes, i, i - first, dt)
+            _copy_result(bodies, lanes, i, i - first, dt)
 
 
 @inlined
@@ -284,7 +284,7 @@ def _step_braced(bodies: Bodies, i: int, dt: float) -> None:
 
 
 @inlined
-def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> None:
+def _copy_result(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> None:
     """Copy the result of lane k to drone i; if it was not in free air, step it again."""
     row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
     if lanes[LANES * BODY_LANES.clear + k] > 0.0 and bodies.braced[i] == 0:

@@ -112,7 +112,7 @@ BALL_SHARE = 0.35  # radius / height from feet to rim; design choice: in a landi
 BELOW_RIM_SHARE = 0.05  # of the same height; design choice: more than a foot's sag, so the rim bears an upturned drone
 FEET = 4  # number of feet, which come first among the contact points
 SLOTS_MAX = 8  # solids within reach of one drone at a time; design choice: as many boxes as can meet in a corner
-LOOK_S = 0.01  # s; two of the longest steps: whatever a drone can touch within this time is within reach
+LOOKAHEAD_S = 0.01  # s; two of the longest steps: whatever a drone can touch within this time is within reach
 _ANGLES = [2.0 * math.pi * (k + 0.5) / HULL_BALLS for k in range(HULL_BALLS)]
 _COSINES = (
     *(el.cos(angle) for angle in _ANGLES),
@@ -262,7 +262,7 @@ def meet_obstacles(bodies: Bodies) -> None:
 def reach_of(row: NDArray, v_WB: Vector) -> float:
     """Return the distance [m] from a drone's centre within which contact is possible in the next steps."""
     reach = max(row[VEHICLE.contact_reach], row[VEHICLE.hull_radius]) + ball(row, POINTS)[1]
-    return reach + LOOK_S * norm(v_WB)
+    return reach + LOOKAHEAD_S * norm(v_WB)
 
 
 @inlined
@@ -327,9 +327,9 @@ def drag(row: Row, depth: float, x: Vector, n: Vector, anchor: NDArray, is_new: 
         anchor[axis] = x[axis] - keep * gap[axis]
 
 
-LOST_M = 1.0  # m; design choice: depth from which a sheet no longer pushes a drone back
-TINY_M = 1e-9  # m; within this distance of an edge or corner a ball keeps its normal
-ROOM_M = 1e-6  # m; margin above the rounding error of a distance
+PENETRATION_MAX_M = 1.0  # m; design choice: depth from which a sheet no longer pushes a drone back
+EDGE_DISTANCE_M = 1e-9  # m; within this distance of an edge or corner a ball keeps its normal
+DISTANCE_MARGIN_M = 1e-6  # m; margin above the rounding error of a distance
 
 
 @noinline
@@ -346,7 +346,7 @@ def meet_surfaces(bodies: Bodies, sheet: Sheet) -> None:
         reach = reach_of(row, vector(state, STATE.v_WB))
         for k in range(BALLS):
             if planes[k, PLANE.side] < 0.0:
-                reach = max(reach, LOST_M)
+                reach = max(reach, PENETRATION_MAX_M)
         away = nearest_point(sheet, p_WB, reach).distance
         if away < reach:
             brace(bodies, i)
@@ -373,7 +373,7 @@ def _follow(row: Row, sheet: Sheet, plane: NDArray, k: int, p_WB: Vector, q_WB: 
     """
     r_B, radius = ball(row, k)
     x = add(p_WB, rotate(q_WB, r_B))
-    closest = nearest_point(sheet, x, away + norm(r_B) + ROOM_M)
+    closest = nearest_point(sheet, x, away + norm(r_B) + DISTANCE_MARGIN_M)
     is_new = plane[PLANE.side] == 0.0
     side = 1.0 if is_new else plane[PLANE.side]
     previous = p_WB if is_new else vector(plane, PLANE.centre_W)
@@ -389,7 +389,7 @@ def _follow(row: Row, sheet: Sheet, plane: NDArray, k: int, p_WB: Vector, q_WB: 
     else:
         if sheet.rim[closest.triangle, closest.feature] != 0:
             side = 1.0
-        if closest.distance > TINY_M:
+        if closest.distance > EDGE_DISTANCE_M:
             n = scaled(subtract(x, closest.point), side / closest.distance)
     plane[PLANE.side], plane[PLANE.distance] = side, side * closest.distance
     plane[PLANE.surface] = sheet.surface[closest.triangle]

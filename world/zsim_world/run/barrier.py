@@ -255,7 +255,7 @@ class Barrier:
         participant = self.participants.get(name)
         return participant is not None and participant.farewell is not None
 
-    def take_back_bye(self, name: str) -> Refusal | None:
+    def retract_bye(self, name: str) -> Refusal | None:
         """Drop the bye of a participant that continues, which another process has sent; return its refusal, or None."""
         participant = self.participants[name]
         if participant.farewell is None:

@@ -143,12 +143,12 @@ class Coordinator(ABC):
         elif kind == "process" and topic == "done":
             if refusal := self.barrier.done(name, message, self.clock.now_ns, wall_ns):
                 self.outbox.refuse(name, key, refusal)
-            elif refusal := self.barrier.take_back_bye(name):
+            elif refusal := self.barrier.retract_bye(name):
                 self.outbox.refuse(name, keys.process(name, "bye"), refusal)
         elif kind == "process" and topic == "join":
             self.join(name, message, wall_ns)
         elif kind == "process" and topic == "bye":
-            self._take_bye(name, message, wall_ns)
+            self._handle_bye(name, message, wall_ns)
 
     def count_output(self, source: str) -> None:
         """Count an output (estimate, cluster state) of a participant."""
@@ -203,7 +203,7 @@ class Coordinator(ABC):
             text = f"{name} and {other} both do the work of {', '.join(sorted(shared))}; end one of them"
             outbox.event("doubled", name, text, {"other": other})
 
-    def _take_bye(self, name: str, message: Bye, wall_ns: int) -> None:
+    def _handle_bye(self, name: str, message: Bye, wall_ns: int) -> None:
         """Remove a participant that says bye; a bye without incarnation takes effect once the token is lost."""
         participant = self.barrier.participants.get(name)
         if participant is None:

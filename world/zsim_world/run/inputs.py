@@ -139,13 +139,13 @@ class Run:
         elif key.startswith("process/") or keys.is_command(key):
             handler = self._hand_over
         else:
-            handler = self._keep_foreign if kind is None else self._refuse_key_of_world
+            handler = self._keep_foreign if kind is None else self._refuse_world_key
         if len(self.handlers) >= messages.KEYS_KEPT:
             self.handlers.clear()
         self.handlers[key] = handler
         return handler
 
-    def _refuse_key_of_world(self, sample: Sample, wall_ns: int) -> None:
+    def _refuse_world_key(self, sample: Sample, wall_ns: int) -> None:
         """Refuse a message that claims to be the world's; neither recorders nor replays get it."""
         self.refuse_sample(sample, DecodeError(f"{sample[0]}: only the world publishes here"))
 

@@ -135,12 +135,12 @@ class RefusalLog:
 
 
 class ChangeBudget(RateLimit):
-    """Limits the changes of each source: `most` at once, then one per period of simulated time."""
+    """Limits the changes of each source: `burst` at once, then one per period of simulated time."""
 
     SAVED: ClassVar[Saved] = {"_spent": dict[str, tuple[float, int]]}
 
-    def __init__(self, now_ns: Callable[[], int], period_ns: float, most: int = CHANGES_MAX) -> None:
-        super().__init__(period_ns, most, now_ns)
+    def __init__(self, now_ns: Callable[[], int], period_ns: float, burst: int = CHANGES_MAX) -> None:
+        super().__init__(period_ns, burst, now_ns)
 
 
 class Budgets:

@@ -38,7 +38,7 @@ NOT_FLYABLE = "a replay: nobody can be flown"
 SEEK_MAX_S = 1e9  # limit that keeps nanoseconds within an int64
 VIEWED_MAX = 10_000  # drones times time steps in one answer to `views`: 2 MB
 VIEWED_MAX_S = 60.0  # simulated time in one answer to `views`; design choice: the replay stands still while reading
-BEFORE_NS = 1_000_000_000  # time within which every source of a view is published at least once
+LOOKBACK_NS = 1_000_000_000  # time within which every source of a view is published at least once
 CAMERA_ROLES = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"}  # roles that publish them
 MARKS_MAX = 400  # marks on a timeline; more would be narrower than a pixel
 UNMARKED_EVENTS = frozenset({"command", "end"})  # kinds of events without a mark; commands are too many
@@ -94,7 +94,7 @@ class Playback(Coordinator):
         super().__init__(scenario, "lockstep", rate, wall_ns, run_id, [])
         self._recorded = info
         self._played = played
-        self._operations |= {"seek": self._seek, "timeline": self._timeline, "views": self._views_of_past}
+        self._operations |= {"seek": self._seek, "timeline": self._timeline, "views": self._past_views}
         self.refused_queries = (
             *(keys.cluster_control(cluster.name) for cluster in scenario.clusters),
             *(keys.drone_control(drone) for drone in scenario.piloted()),
@@ -177,11 +177,11 @@ class Playback(Coordinator):
     def _live(self) -> _Live:
         served = [each.served_names for each in self.barrier.participants.values()]
 
-        def is_of_cameras(name: str) -> bool:
+        def is_camera_process(name: str) -> bool:
             role, _, drone = name.partition(".")
             return role in CAMERA_ROLES.values() and drone in self._cameras
 
-        by_name = {name for names in served if not any(map(is_of_cameras, names)) for name in names}
+        by_name = {name for names in served if not any(map(is_camera_process, names)) for name in names}
         return _Live({name for names in served for name in names}, by_name)
 
     def _is_replaced(self, recorded: Recorded, live: _Live) -> bool:
@@ -335,7 +335,7 @@ class Playback(Coordinator):
                     marks.append({"t_s": event.t_ns / 1e9, "kind": event.kind, "text": text[:TEXT_MAX]})
         return ControlAnswer(True, result={**span, "marks": marks[:: -(-len(marks) // MARKS_MAX) or 1]})
 
-    def _views_of_past(self, request: ControlRequest) -> Refusal | ControlAnswer:
+    def _past_views(self, request: ControlRequest) -> Refusal | ControlAnswer:
         """Answer with the views at instants on record, `every_s` apart, for curves and trails."""
         from_s, to_s, every_s = (number(request.args.get(name)) for name in ("from_s", "to_s", "every_s"))
         if from_s is None or not 0.0 <= from_s < SEEK_MAX_S:
@@ -348,7 +348,7 @@ class Playback(Coordinator):
         instants = [round((from_s + k * every_s) * 1e9) for k in range(int((to_s - from_s) / every_s) + 1)]
         last: dict[str, bytes] = {}
         views: list[tuple[str, bytes]] = []
-        for seq, (t_ns, passed) in enumerate(self._recorded_gates.before(instants, self._viewed, BEFORE_NS)):
+        for seq, (t_ns, passed) in enumerate(self._recorded_gates.latest_before(instants, self._viewed, LOOKBACK_NS)):
             last |= passed
             if any(key.endswith("/truth") for key in passed):  # otherwise a gap in the record, or its end
                 views += [(key, messages.encode(message)) for key, message in self._build_views(last, t_ns, seq)]
@@ -403,7 +403,7 @@ class RecordedGates:
         gates: deque[int] = deque()
         newest = None
 
-        def take(t_ns: int) -> Gate:
+        def pop_gate(t_ns: int) -> Gate:
             """Return a gate, including the messages due at earlier gates that are missing from the record."""
             due = sorted(gate_ns for gate_ns in waiting if gate_ns <= t_ns)
             return Gate(t_ns, [recorded for gate_ns in due for recorded in waiting.pop(gate_ns)])
@@ -420,11 +420,11 @@ class RecordedGates:
                 newest = recorded.t_ns
                 gates.append(newest)
                 while gates[0] + self._slack_ns <= newest:
-                    yield take(gates.popleft())
+                    yield pop_gate(gates.popleft())
         for t_ns in gates:
-            yield take(t_ns)
+            yield pop_gate(t_ns)
 
-    def before(
+    def latest_before(
         self, instants_ns: Sequence[int], wanted: Collection[str], back_ns: int
     ) -> Iterator[tuple[int, dict[str, bytes]]]:
         """Yield each instant with the last payload by key since the previous instant.

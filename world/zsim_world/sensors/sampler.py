@@ -129,22 +129,22 @@ def _is_before(a: NDArray, b: NDArray) -> bool:
 
 
 @kernel()
-def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+def insert_rows(whose: NDArray, values: NDArray, inserted: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Return measurements with rows of zero values inserted: `whose`, `values` and the indices of the inserted rows.
 
     Args:
         whose, values: fields of Sampled, sorted as there.
-        more: rows of `whose` to insert, sorted likewise, (K, WHOSE.size).
+        inserted: rows of `whose` to insert, sorted likewise, (K, WHOSE.size).
     """
-    count, extra = whose.shape[0], more.shape[0]
+    count, extra = whose.shape[0], inserted.shape[0]
     index, numbers = np.empty((count + extra, WHOSE.size), np.int64), np.zeros((count + extra, VALUE_COLUMNS))
     places, m = np.empty(extra, np.int64), 0
     for k in range(extra + 1):
-        while m < count and (k == extra or _is_before(whose[m], more[k])):
+        while m < count and (k == extra or _is_before(whose[m], inserted[k])):
             index[m + k], numbers[m + k] = whose[m], values[m]
             m += 1
         if k < extra:
-            index[m + k], places[k] = more[k], m + k
+            index[m + k], places[k] = inserted[k], m + k
     return index, numbers, places
 
 

@@ -38,10 +38,10 @@ from zsim_world.physics.fleet_arrays import (
     PerRotor,
     Row,
     four,
-    of,
     put,
     put_four,
     put_value,
+    value_of,
     vector,
 )
 from zsim_world.physics.rigid_body import charge_percent, mix
@@ -276,7 +276,7 @@ def _decide(time: KernelTime, bodies: Bodies, boards: Boards, lanes: NDArray, i:
     belief[BELIEF.heading] = heading
     put_four(belief, BELIEF.q_WB, lane_four(lanes, BOARD_LANES.q_WB, k))
     put(belief, BELIEF.w_WB_B, lane_vector(lanes, BOARD_LANES.w_WB_B, k))
-    on_ground = stands(memory, setting)
+    on_ground = is_standing(memory, setting)
     gain, device, board = boards.gain[i], boards.device[i], boards.calibration[i]
     own = observer.observe(belief, own, turned, row, gain, device, board, on_ground, each)
     silence = (time.clock[CLOCK.tick] - boards.set_tick[i]) * time.spans[SPAN.dt]
@@ -308,12 +308,15 @@ def _drive(lanes: NDArray, each: tuple[int, ...]) -> None:
         gains = lane_vector(lanes, BOARD_LANES.drive, k) + lane_vector(lanes, BOARD_LANES.drive + 3, k)
         thrust, yaw_rate = lanes[LANES * BOARD_LANES.thrust + k], lanes[LANES * BOARD_LANES.yaw_rate + k]
         rotors, speeds = _rotors(lanes, BOARD_ROTORS.known, k, each), _rotors(lanes, BOARD_ROTORS.speed, k, each)
-        commands, wanted = _rotors(lanes, BOARD_ROTORS.command, k, each), _rotors(lanes, BOARD_ROTORS.drive, k, each)
+        commands, driven_commands = (
+            _rotors(lanes, BOARD_ROTORS.command, k, each),
+            _rotors(lanes, BOARD_ROTORS.drive, k, each),
+        )
         row = lane_row(lanes, k)
-        drive(row, rotors, gains, own, attitude, rate, speeds, z, thrust, yaw_rate, wanted)
+        drive(row, rotors, gains, own, attitude, rate, speeds, z, thrust, yaw_rate, driven_commands)
         driven = lanes[LANES * BOARD_LANES.driven + k] > 0.0
         for r in range(len(each)):
-            put_value(commands, r, of(wanted, 0, r) if driven else of(commands, 0, r))
+            put_value(commands, r, value_of(driven_commands, 0, r) if driven else value_of(commands, 0, r))
 
 
 @inlined
@@ -322,7 +325,7 @@ def _command(bodies: Bodies, boards: Boards, i: int, commands: PerRotor) -> None
     charged, command = bodies.energy[i] > 0.0, bodies.command[i]
     observer.model_rotors(boards.belief[i], boards.setting[i, SETTING.rotor_decay], commands)
     for r in range(len(commands.each)):
-        command[r] = of(commands, 0, r) if charged else 0.0
+        command[r] = value_of(commands, 0, r) if charged else 0.0
     if boards.actuator[i, ACTUATOR.faulty] != 0.0 and charged:
         _weaken(bodies.command[i], boards.actuator[i])
 
@@ -384,7 +387,7 @@ def decide(
 
 
 @inlined
-def stands(memory: NDArray, setting: NDArray) -> bool:
+def is_standing(memory: NDArray, setting: NDArray) -> bool:
     """Return whether the firmware assumes that the drone stands on the ground: landed, or spinning up."""
     spinning_up = memory[MEMORY.mode] == TAKING_OFF and memory[MEMORY.steps] * STEP_S < setting[SETTING.spin_up]
     return memory[MEMORY.mode] == LANDED or spinning_up
@@ -421,11 +424,11 @@ def _change_mode(
     elif mode != LANDING and charge_percent < setting[SETTING.low_battery]:
         enter(memory, belief, LANDING)
     elif mode in (HOVERING, FLYING):
-        wanted = _wanted(int(setpoint[SETPOINT.kind]), silence_s, hover_s, land_s)
-        if wanted != mode:
-            enter(memory, belief, wanted)
+        new_mode = _next_mode(int(setpoint[SETPOINT.kind]), silence_s, hover_s, land_s)
+        if new_mode != mode:
+            enter(memory, belief, new_mode)
     elif mode == TAKING_OFF:
-        if _arrived(memory, belief, setting):
+        if _has_arrived(memory, belief, setting):
             height = memory[MEMORY.hold_z]
             enter(memory, belief, HOVERING)
             memory[MEMORY.hold_z], memory[MEMORY.holds_z] = height, HOLDING
@@ -436,7 +439,7 @@ def _change_mode(
 
 
 @inlined
-def _wanted(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
+def _next_mode(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
     """Return the mode of a hovering or flying drone, given the kind and age of its setpoint."""
     if kind == NONE:
         return HOVERING
@@ -446,7 +449,7 @@ def _wanted(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
 
 
 @inlined
-def _arrived(memory: NDArray, belief: NDArray, setting: NDArray) -> bool:
+def _has_arrived(memory: NDArray, belief: NDArray, setting: NDArray) -> bool:
     if memory[MEMORY.steps] * STEP_S > setting[SETTING.ascent_max]:
         return True
     error = abs(memory[MEMORY.hold_z] - belief[BELIEF.height])
@@ -472,9 +475,9 @@ def _fly(
         for r in range(len(rotors.each)):
             put_value(commands, r, clipped(rotors, r, setpoint[SETPOINT.value + r]))
         return COMMAND_IS_SET
-    if stands(memory, setting):
+    if is_standing(memory, setting):
         for r in range(len(rotors.each)):
-            put_value(commands, r, of(rotors, ROTOR.low, r))
+            put_value(commands, r, value_of(rotors, ROTOR.low, r))
         return COMMAND_IS_SET
     if mode == FLYING and kind == ATTITUDE:
         z_des, lift, yaw_rate = _from_attitude(own, setting, setpoint)
@@ -510,7 +513,7 @@ def _from_velocity(
     if mode == FLYING:
         v_des, yaw_rate = _commanded_velocity(kind, own, setting, setpoint)
     else:
-        v_des = _held(memory, belief, own, setting, v_des)
+        v_des = _hold_velocity(memory, belief, own, setting, v_des)
     v_des = (v_des[0], v_des[1], _climb(mode, v_des[2], memory, belief, row, setting, each))
     # specific thrust: desired acceleration, less disturbance and drag, plus gravity
     f = axpy(vector(belief, BELIEF.disturbance), -row[VEHICLE.drag] / row[VEHICLE.mass], v)
@@ -541,7 +544,7 @@ def _commanded_velocity(kind: int, own: Quaternion, setting: NDArray, setpoint: 
 
 
 @inlined
-def _held(memory: NDArray, belief: NDArray, own: Quaternion, setting: NDArray, v_des: Vector) -> Vector:
+def _hold_velocity(memory: NDArray, belief: NDArray, own: Quaternion, setting: NDArray, v_des: Vector) -> Vector:
     """Return `v_des` with its horizontal part replaced by the velocity that holds the odometry's position."""
     v_W = rot.rotate(own, vector(belief, BELIEF.v_H))
     for k in range(2):
@@ -557,7 +560,7 @@ def _held(memory: NDArray, belief: NDArray, own: Quaternion, setting: NDArray, v
 @inlined
 def _climb(
     mode: int,
-    wanted: float,
+    commanded: float,
     memory: NDArray,
     belief: NDArray,
     row: NDArray,
@@ -570,9 +573,9 @@ def _climb(
         return -_descent(memory, belief, row, setting, each)
     if mode == TAKING_OFF:
         return _ascent(memory, belief, row, setting)
-    if wanted != 0.0:
+    if commanded != 0.0:
         memory[MEMORY.holds_z] = 0.0
-        return min(wanted, setting[SETTING.k_height] * (setting[SETTING.altitude] - height))
+        return min(commanded, setting[SETTING.k_height] * (setting[SETTING.altitude] - height))
     if memory[MEMORY.holds_z] != HOLDING:
         ahead = height + belief[BELIEF.v_H + 2] / setting[SETTING.k_climb]
         memory[MEMORY.hold_z], memory[MEMORY.holds_z] = max(ahead, 2.0 * row[VEHICLE.stand_height]), HOLDING
@@ -649,14 +652,14 @@ def drive(
     )
     mix(row, rotors, thrust_n, moment, commands)
     for r in range(len(rotors.each)):  # overdriven commands shorten the rotors' lag
-        speed = of(speeds, 0, r)
-        put_value(commands, r, clipped(rotors, r, speed + overdrive * (of(commands, 0, r) - speed)))
+        speed = value_of(speeds, 0, r)
+        put_value(commands, r, clipped(rotors, r, speed + overdrive * (value_of(commands, 0, r) - speed)))
 
 
 @inlined
 def clipped(rotors: PerRotor, r: int, speed: float) -> float:
     """Return a speed [rad/s], clipped to the limits of rotor r."""
-    return min(max(speed, of(rotors, ROTOR.low, r)), of(rotors, ROTOR.high, r))
+    return min(max(speed, value_of(rotors, ROTOR.low, r)), value_of(rotors, ROTOR.high, r))
 
 
 @inlined

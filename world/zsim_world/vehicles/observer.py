@@ -36,10 +36,10 @@ from zsim_world.physics.fleet_arrays import (
     VEHICLE,
     PerRotor,
     four,
-    of,
     put,
     put_four,
     put_value,
+    value_of,
     vector,
 )
 from zsim_world.physics.rigid_body import free_thrust, lagged
@@ -114,7 +114,7 @@ def _turn_by(belief: NDArray, own: Quaternion, r_H: Vector) -> Quaternion:
 
 
 @inlined
-def _take_bias(belief: NDArray, own: Quaternion, r_H: Vector) -> None:
+def _correct_bias(belief: NDArray, own: Quaternion, r_H: Vector) -> None:
     """Correct the gyro's bias by a rate error [rad/s; heading frame]."""
     q_HB = rot.level(own, four(belief, BELIEF.q_WB))
     put(belief, BELIEF.gyro_bias, axpy(vector(belief, BELIEF.gyro_bias), -1.0, rot.rotate_back(q_HB, r_H)))
@@ -165,12 +165,12 @@ def observe(
     else:
         _fly(belief, row, gain, own, f_B, turned, each)
         if device[DEVICE.new_flow] > 0.0 and device[DEVICE.flow_quality] >= FLOW_QUALITY_MIN:
-            own = _see_flow(belief, gain, own, vector(device, DEVICE.flow))
+            own = _fuse_flow(belief, gain, own, vector(device, DEVICE.flow))
         _measure_height(belief, gain, device, board[CALIBRATION.sonar_min])
     if device[DEVICE.new_baro] > 0.0:
-        _see_baro(belief, gain, device[DEVICE.baro], on_ground)
+        _fuse_baro(belief, gain, device[DEVICE.baro], on_ground)
     if device[DEVICE.new_mag] > 0.0 and not math.isnan(board[CALIBRATION.mag_bearing]):
-        own = _see_mag(
+        own = _fuse_mag(
             belief,
             gain,
             own,
@@ -260,14 +260,14 @@ def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
 
 
 @inlined
-def _see_flow(belief: NDArray, gain: NDArray, own: Quaternion, flow_H: Vector) -> Quaternion:
+def _fuse_flow(belief: NDArray, gain: NDArray, own: Quaternion, flow_H: Vector) -> Quaternion:
     """Correct velocity, disturbance, tilt, bias and climb rate by a flow velocity; return the new heading frame."""
     e = axpy(flow_H, -1.0, vector(belief, BELIEF.v_H))
     _correct(belief, gain, GAIN.flow_v, e)
     tilt, rate = gain[GAIN.flow_tilt], gain[GAIN.flow_rate]  # the accelerometer does not correct these
     # a drone that is faster forward than estimated is pitched further forward than estimated
     own = _turn_by(belief, own, (-tilt * e[1], tilt * e[0], 0.0))
-    _take_bias(belief, own, (-rate * e[1], rate * e[0], 0.0))
+    _correct_bias(belief, own, (-rate * e[1], rate * e[0], 0.0))
     _lift_by(belief, gain, GAIN.climb_z, e[2])
     return own
 
@@ -285,7 +285,7 @@ def _measure_height(belief: NDArray, gain: NDArray, device: NDArray, sonar_min: 
 
 
 @inlined
-def _see_baro(belief: NDArray, gain: NDArray, altitude: float, on_ground: bool) -> None:
+def _fuse_baro(belief: NDArray, gain: NDArray, altitude: float, on_ground: bool) -> None:
     """Estimate the barometer's reading at height zero: on the ground, and in the air while the sonar has an echo."""
     if on_ground or belief[BELIEF.sonar_age] <= SONAR_AGE_MAX:
         n = belief[BELIEF.baro_samples] + 1.0
@@ -295,7 +295,7 @@ def _see_baro(belief: NDArray, gain: NDArray, altitude: float, on_ground: bool) 
 
 
 @inlined
-def _see_mag(belief: NDArray, gain: NDArray, own: Quaternion, field_B: Vector, bearing: float) -> Quaternion:
+def _fuse_mag(belief: NDArray, gain: NDArray, own: Quaternion, field_B: Vector, bearing: float) -> Quaternion:
     """Correct heading and vertical gyro bias; average the first samples. Return the new heading frame."""
     field_H = rot.rotate(rot.level(own, four(belief, BELIEF.q_WB)), field_B)
     if field_H[0] * field_H[0] + field_H[1] * field_H[1] < FIELD_MIN_UT * FIELD_MIN_UT:
@@ -305,7 +305,7 @@ def _see_mag(belief: NDArray, gain: NDArray, own: Quaternion, field_B: Vector, b
     e = rot.wrapped(bearing - el.atan2(field_H[1], field_H[0]) - belief[BELIEF.heading])
     own = _turn_by(belief, own, (0.0, 0.0, max(1.0 / n, gain[GAIN.mag_psi]) * e))
     if 1.0 / n < gain[GAIN.mag_psi]:
-        _take_bias(belief, own, (0.0, 0.0, gain[GAIN.mag_rate] * e))
+        _correct_bias(belief, own, (0.0, 0.0, gain[GAIN.mag_rate] * e))
     return own
 
 
@@ -314,7 +314,7 @@ def model_rotors(belief: NDArray, decay: float, commands: PerRotor) -> None:
     """Advance the modelled rotors by one step under commands [rad/s]; `decay`: fraction of the speed error left."""
     speeds = PerRotor(belief, BELIEF.size, 1, commands.each)
     for r in range(len(commands.each)):
-        put_value(speeds, r, lagged(of(speeds, 0, r), of(commands, 0, r), decay))
+        put_value(speeds, r, lagged(value_of(speeds, 0, r), value_of(commands, 0, r), decay))
 
 
 Array = NDArray[np.float64]

@@ -101,7 +101,7 @@ class ClusterSpace(ABC):
         """Return positions p_W (n, 3) [m] and headings yaw (n,) [rad, wrapped] of robots in the formation c (4n,).
 
         Raises:
-            SingularClusterError: the shape has no extent (h = 0), so that the robots' positions are undefined.
+            SingularClusterError: the shape has no direction, so that the robots' positions are undefined.
         """
 
     @abstractmethod
@@ -139,9 +139,9 @@ class ClusterSpace(ABC):
     def margin(self, c: Array) -> float:
         """Return the distance to singularity [m]: spread(c) cos(pitch).
 
-        It is zero exactly where J^-1 is singular (robots 1, 2, 3 collinear or two of them coincident, another robot on
-        the z axis through robot 1, or pitch at 90 degrees); in a level formation, it is the distance by which one robot
-        may move before J^-1 becomes singular.
+        It is zero exactly where J^-1 is singular (for a TriadCluster: robots 1, 2, 3 collinear or two of them
+        coincident, another robot on the z axis through robot 1, or pitch at 90 degrees); in a level formation, it is
+        the distance by which one robot may move before J^-1 becomes singular.
         """
         return self.measures(c)[1]
 

@@ -110,7 +110,7 @@ class NestedCluster(ClusterSpace):
 
     def __init__(self, parent: ClusterSpace, groups: Sequence[tuple[str, ClusterSpace]]) -> None:
         if len(groups) != parent.n:
-            raise ValueError(f"groups: {len(groups)}; allowed: {parent.n}, as their parent has robots")
+            raise ValueError(f"groups: {len(groups)}; allowed: {parent.n}, one per robot of their parent")
         self.parent = parent
         self._groups: list[_Group] = []
         names, robots = list(parent.names), 0

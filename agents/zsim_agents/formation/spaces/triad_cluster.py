@@ -1,4 +1,4 @@
-"""Clusters of two, three (the paper's) or more robots, whose frame is given by robots 1, 2 and 3.
+"""Clusters of three (the paper's) or more robots, whose frame is given by robots 1, 2 and 3, and clusters of two.
 
 Robots 1, 2 and 3 define the frame C and the triangle (p, q, beta); each further robot k adds its distance rho, azimuth
 and elevation from robot 1 in C. The origin is the centroid of all robots. Two robots form a rod with direction and
@@ -132,7 +132,7 @@ def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
 
 @portable
 def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
-    """Write positions (n, 3) and headings (n,), and return whether they are valid, i.e. the shape has an extent."""
+    """Write positions (n, 3) and headings (n,), and return whether they are valid, i.e. the shape has a direction."""
     n = c.size // 4
     put_positions_C(c, p_W)
     R_WC = matrix_from_rpy(c[3], c[4], c[5])
@@ -146,7 +146,7 @@ def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
 
 @portable
 def triad_inverse_jacobian(c: Array, J_inv: Array) -> bool:
-    """Write J^-1 (4n, 4n), zero on entry, and return whether the shape has an extent; without one, write nothing.
+    """Write J^-1 (4n, 4n), zero on entry, and return whether the shape has a direction; without one, write nothing.
 
     Robot i moves at v_c + R_WC (w_WC_C x d_i + d_i') and turns at yaw' + phi_i'; d_i is its position in C, and d_i' the
     rate of this position due to changes of the shape.
@@ -183,7 +183,7 @@ def put_shape_rates(J_inv: Array, c: Array, R_WC: Matrix) -> None:
 
 @portable
 def add_rate(J_inv: Array, robot: int, column: int, rate_W: Vector) -> None:
-    """Add the motion of one robot per unit of a variable; all robots move back by the mean to keep the centroid."""
+    """Add the motion of one robot per unit of a variable; all move back by the mean, so that the centroid stays."""
     n = J_inv.shape[0] // 4
     for k in range(3):
         mean_rate = rate_W[k] / n
@@ -367,7 +367,7 @@ class PairCluster(ClusterSpace):
 
 @portable
 def pair_forward(p_W: Array, yaw: Array, c: Array) -> None:
-    """Write c (8,); if the length p is zero, only p is valid."""
+    """Write c (8,); if the length p is zero, only the centroid and p are valid."""
     d_W = subtract(row(p_W, 0), row(p_W, 1))
     c[0], c[1], c[2] = centroid(p_W)
     c[3], c[4] = pitch_yaw(d_W)

@@ -122,7 +122,7 @@ def along(from_s: float, to_s: float = 30.0) -> State:
 
     def state(t_s: float) -> dict[str, Any]:
         led = from_s <= t_s <= to_s
-        reason = "" if led or t_s < 10 or t_s > to_s else f"trajectory{WAITING}a robot moves at 2.88 of its limits"
+        reason = "" if led or t_s < 10 or t_s > to_s else f"trajectory{WAITING}a robot moves at 2.88 times its limits"
         return {"phase": "engaged", "desired": tuple(way.value(t_s - 10.0)[0] if led else at_target), "reason": reason}
 
     return state

@@ -85,7 +85,7 @@ class Link:
 
     def request(self, key: str, op: str, source: str, args: dict[str, Any]) -> ControlAnswer:
         self.asked.append((key, op, source, args))
-        return ControlAnswer(False, "phase is idle; possible when engaged")
+        return ControlAnswer(False, "phase is idle; must be engaged")
 
     def get(self, key: str, timeout_s: float) -> list[ReceivedSample]:
         return [ReceivedSample(key, self.last[key])] if key in self.last else []

@@ -154,7 +154,7 @@ def test_correlation_time_is_length_over_airspeed(airspeed, tau):
 
 def test_without_fresh_noise_a_gust_decays():
     gust = np.array([1.0, -2.0, 0.5])
-    contacts.blow(parameters(), CALM, gust, CALM, CALM, 0.5)
+    contacts.advance_gust(parameters(), CALM, gust, CALM, CALM, 0.5)
     # airspeed 2.29 m/s: correlation time 10 / 2.29
     decay = math.exp(-0.5 * math.sqrt(1 + 4 + 0.25) / 10.0)
     np.testing.assert_allclose(gust, np.array([1.0, -2.0, 0.5]) * decay, rtol=1e-12)
@@ -162,7 +162,7 @@ def test_without_fresh_noise_a_gust_decays():
 
 def test_steady_wind_and_motion_count_as_airspeed():
     gust = np.array([1.0, 0.0, 0.0])
-    contacts.blow(parameters(steady=(6.0, 0.0, 0.0)), (-1.0, 0.0, 0.0), gust, CALM, CALM, 0.5)
+    contacts.advance_gust(parameters(steady=(6.0, 0.0, 0.0)), (-1.0, 0.0, 0.0), gust, CALM, CALM, 0.5)
     assert math.isclose(gust[0], math.exp(-0.5 * 8.0 / 10.0), rel_tol=1e-12)
 
 
@@ -170,7 +170,7 @@ def test_the_gust_variance_is_independent_of_the_step():
     """sigma^2 = decay^2 sigma^2 + fresh^2: a normal number of 1 adds sigma sqrt(1 - decay^2)."""
     for dt in (0.005, 0.1, 20.0):
         gust = np.zeros(3)
-        contacts.blow(parameters(gust=0.7, correlation=0.0), CALM, gust, CALM, (1.0, 1.0, 1.0), dt)
+        contacts.advance_gust(parameters(gust=0.7, correlation=0.0), CALM, gust, CALM, (1.0, 1.0, 1.0), dt)
         decay = math.exp(-dt / 5.0)
         np.testing.assert_allclose(gust, 0.7 * math.sqrt(1 - decay**2), rtol=1e-12)
 

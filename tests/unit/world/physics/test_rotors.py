@@ -20,10 +20,10 @@ from zsim_world.physics.fleet_arrays import (
     VEHICLE,
     PerRotor,
     mixed,
-    of,
-    place,
+    rotor_layout,
     rotor_row,
     rotor_slots,
+    value_of,
     vehicle_row,
 )
 from zsim_world.physics.rigid_body import ground_effect, lagged
@@ -164,9 +164,9 @@ def test_the_compiled_constants_are_those_of_the_stock_vehicles(model: str):
     _, rotors = one_drone(model=model)
     assert len(rotors.each) == CROSS_ROTORS
     for r in rotors.each:
-        assert place(rotors, r) == tuple(of(rotors, group, r) for group in (ROTOR.x, ROTOR.y, ROTOR.turn))
+        assert rotor_layout(rotors, r) == tuple(value_of(rotors, group, r) for group in (ROTOR.x, ROTOR.y, ROTOR.turn))
         groups = (ROTOR.roll, ROTOR.pitch, ROTOR.yaw, ROTOR.yaw_inverse)
-        assert mixed(rotors, r) == tuple(of(rotors, group, r) for group in groups)
+        assert mixed(rotors, r) == tuple(value_of(rotors, group, r) for group in groups)
 
 
 def test_other_vehicles_have_rotor_positions_of_their_own():
@@ -175,7 +175,9 @@ def test_other_vehicles_have_rotor_positions_of_their_own():
     assert rotor_slots([*stock, plus()]) == CROSS_ROTORS + 1
     assert rotor_slots([*stock, vehicle_of("hexacopter")]) == 6
     _, rotors = one_drone(model="hexacopter")
-    assert np.array(place(rotors, 0)).tolist() == [of(rotors, group, 0) for group in (ROTOR.x, ROTOR.y, ROTOR.turn)]
+    assert np.array(rotor_layout(rotors, 0)).tolist() == [
+        value_of(rotors, group, 0) for group in (ROTOR.x, ROTOR.y, ROTOR.turn)
+    ]
 
 
 def hover(row):

@@ -10,11 +10,11 @@ from fake_link import FakeLink
 
 from zsim.contract import keys
 from zsim.transport.link_watch import (
+    BACKLOG_MAX_BYTES,
+    CLOSURES_MAX,
     EXCLUSION_S,
-    HELD_BYTES,
     LOOK_S,
     REPORT_PERIOD_S,
-    SPARED,
     STALL_BYTES,
     STALL_S,
     Awaited,
@@ -71,7 +71,7 @@ class Case:
 
 def test_a_stalled_reader_is_closed_and_an_awaited_process_only_reported():
     case = Case()
-    case.sockets.held = {READER: STALL_BYTES, RECORDER: 100 * HELD_BYTES, ROUTER: 100 * HELD_BYTES}
+    case.sockets.held = {READER: STALL_BYTES, RECORDER: 100 * BACKLOG_MAX_BYTES, ROUTER: 100 * BACKLOG_MAX_BYTES}
     case.passes(STALL_S + 2 * LOOK_S)
     assert case.sockets.closed == [READER]
     (closed,) = case.watch.closed
@@ -85,13 +85,13 @@ def test_of_two_awaited_processes_only_the_stalled_one_is_stuck():
     case.awaited.append(Awaited(("estimator.d1",), 8))
     case.link.ends[ESTIMATOR] = FarEnd("e", False)
     case.link.show(keys.session_token("estimator.d1", "e"))
-    case.sockets.held = {RECORDER: 10 * HELD_BYTES, ESTIMATOR: HELD_BYTES}
+    case.sockets.held = {RECORDER: 10 * BACKLOG_MAX_BYTES, ESTIMATOR: BACKLOG_MAX_BYTES}
     case.passes(2.0, taken=1)  # by the links that the case began with
     assert case.watch.stuck() == [f"estimator.d1 at {ESTIMATOR}"]
     assert case.sockets.closed == []
 
 
-@pytest.mark.parametrize(("held_bytes", "closed"), [(STALL_BYTES, []), (HELD_BYTES, [READER])])
+@pytest.mark.parametrize(("held_bytes", "closed"), [(STALL_BYTES, []), (BACKLOG_MAX_BYTES, [READER])])
 def test_a_slow_reader_is_closed_only_if_it_never_catches_up(held_bytes: int, closed: list[str]):
     case = Case()
     case.sockets.held = {READER: held_bytes}
@@ -112,7 +112,7 @@ def test_a_long_round_trip_is_allowed_for():
 def test_no_link_is_closed_while_an_awaited_process_may_be_behind_any():
     case = Case()
     case.awaited.append(Awaited(("estimator.d1",), 8))  # a user's own program, which does not show its session
-    case.sockets.held = {READER: HELD_BYTES}
+    case.sockets.held = {READER: BACKLOG_MAX_BYTES}
     case.passes(2.0)
     assert case.sockets.closed == []
     case.link.show(keys.session_token("estimator.d1", "e"))
@@ -125,7 +125,7 @@ def test_a_local_awaited_process_is_identified_by_its_pid():
         case, here = Case(), "{}:{}".format(*reader.getsockname())
         case.awaited.append(Awaited(("estimator.d1",), os.getpid()))
         case.link.ends[here] = FarEnd("r", False)
-        case.sockets.held = {here: HELD_BYTES}
+        case.sockets.held = {here: BACKLOG_MAX_BYTES}
         case.passes(2.0)
         assert case.sockets.closed == []
         case.awaited[-1] = Awaited(("estimator.d1",), os.getpid() + 1)
@@ -136,51 +136,51 @@ def test_a_local_awaited_process_is_identified_by_its_pid():
 
 def test_a_reader_that_stalls_repeatedly_is_kept_out_for_a_while():
     case = Case()
-    for _ in range(SPARED):
-        case.sockets.held = {READER: HELD_BYTES}
+    for _ in range(CLOSURES_MAX):
+        case.sockets.held = {READER: BACKLOG_MAX_BYTES}
         case.passes(2.0)
-    assert len(case.sockets.closed) == SPARED
+    assert len(case.sockets.closed) == CLOSURES_MAX
     case.sockets.held = {READER: 0}
     case.passes(2.0)
-    assert len(case.sockets.closed) == SPARED + 1
+    assert len(case.sockets.closed) == CLOSURES_MAX + 1
     case.passes(2 * EXCLUSION_S)
     case.sockets.held = {READER: 0}
     case.passes(2.0)
-    assert len(case.sockets.closed) == SPARED + 1
+    assert len(case.sockets.closed) == CLOSURES_MAX + 1
 
 
 def test_a_reader_that_is_kept_out_loses_its_other_links_at_once():
     case, other = Case(), "192.168.1.2:41999"
     case.link.ends[other] = case.link.ends[READER]
-    for number in range(SPARED):
-        case.sockets.held = {READER: HELD_BYTES, **({other: 0} if number == SPARED - 1 else {})}
+    for number in range(CLOSURES_MAX):
+        case.sockets.held = {READER: BACKLOG_MAX_BYTES, **({other: 0} if number == CLOSURES_MAX - 1 else {})}
         while READER in case.sockets.held:
             case.passes(LOOK_S)
-    assert case.sockets.closed == [READER] * SPARED + [other]
+    assert case.sockets.closed == [READER] * CLOSURES_MAX + [other]
 
 
 def test_closed_links_of_a_session_are_reported_at_intervals_with_a_count():
     case = Case()
-    for _ in range(SPARED - 1):
-        case.sockets.held = {READER: HELD_BYTES}
+    for _ in range(CLOSURES_MAX - 1):
+        case.sockets.held = {READER: BACKLOG_MAX_BYTES}
         case.passes(1.0)
     assert [closed.times for closed in case.watch.closed] == [1]
     case.passes(REPORT_PERIOD_S)
-    case.sockets.held = {READER: HELD_BYTES}
+    case.sockets.held = {READER: BACKLOG_MAX_BYTES}
     case.passes(1.0)
-    assert [closed.times for closed in case.watch.closed] == [1, SPARED]
+    assert [closed.times for closed in case.watch.closed] == [1, CLOSURES_MAX]
 
 
 def test_a_session_that_is_kept_out_is_reported_only_if_it_holds_data_back():
     case = Case()
-    for _ in range(SPARED):
-        case.sockets.held = {READER: HELD_BYTES}
+    for _ in range(CLOSURES_MAX):
+        case.sockets.held = {READER: BACKLOG_MAX_BYTES}
         case.passes(1.0)
     case.watch.closed.clear()
     case.passes(REPORT_PERIOD_S)
     case.sockets.held = {READER: STALL_BYTES - 1}
     case.passes(1.0)
-    assert len(case.sockets.closed) == SPARED + 1
+    assert len(case.sockets.closed) == CLOSURES_MAX + 1
     assert list(case.watch.closed) == []
 
 
