@@ -151,7 +151,7 @@ def _paths(board: Board, first_seed_rows: dict[tuple[str, str], Row]) -> style.R
         panels[line, 0].set_ylabel(scenario.replace("_", " "), fontsize=style.PAPER_PT)
     caption = (
         "Seen from above, x to the right; each drone in its colour, with a dot where it was last in the air; dashed: "
-        "path of the reference's centre. All panels of a row have the same scale."
+        "path of the reference's centre. All panels of a row have the same scale. No path: the flight failed."
     )
     return style.ReportFigure("ways.png", "Paths of the drones, first seed", caption, figure)
 
@@ -187,6 +187,6 @@ def _shapes(board: Board, first_seed_rows: dict[tuple[str, str], Row]) -> style.
     caption = (
         "Root mean square distance of the drones from their desired positions, after the best fit of what the law "
         "leaves open; "
-        f"laws without desired positions are not shown. {descriptions[0].upper()}{descriptions[1:]}."
+        f"laws without desired positions, or whose flight failed, are not shown. {descriptions[0].upper()}{descriptions[1:]}."
     )
     return style.ReportFigure("shapes.png", "Shape error over time, first seed", caption, figure)
