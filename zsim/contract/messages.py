@@ -120,7 +120,7 @@ def message_info(kind: type[AgentMessage]) -> MessageInfo:
         raise ValueError(f"{kind.__name__}.key is {kind.key!r:.60}; {reserved}")
     info = MessageInfo(f"{parts[1]}/*/{parts[3]}", kind.__name__, field_types(kind, AgentMessage))
     if not info.is_sound():
-        raise ValueError(f"{kind.__name__}, or a field, has an invalid name; must be a letter and up to 31 of a-z 0-9 _")
+        raise ValueError(f"{kind.__name__}, or a field, is misnamed; must be a letter and up to 31 of a-z 0-9 _")
     return info
 
 
