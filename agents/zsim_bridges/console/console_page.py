@@ -5,7 +5,7 @@ drones, and its own list of events.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
@@ -262,15 +262,15 @@ class PageForms:
         self,
         rows: Sequence[DroneRow],
         metrics: Mapping[str, FlightMetrics],
-        sensors_of: Callable[[str], str],
+        sensors_of: Callable[[Collection[str]], Mapping[str, str]],
         events: Sequence[EventRow],
     ) -> None:
         """Show on each page the sorted and filtered drones, the figures of the chosen one, and the filtered events.
 
-        `sensors_of` returns the table of a drone's sensors as HTML.
+        `sensors_of` returns the table of each drone's sensors as HTML, by drone.
         """
         chosen = {form.drone.chosen for form in list(self._forms.values())}
-        contents = {drone: (metric_lines(metrics.get(drone)), sensors_of(drone)) for drone in chosen}
+        contents = {drone: (metric_lines(metrics.get(drone)), table) for drone, table in sensors_of(chosen).items()}
 
         def show(form: _PageForm) -> None:
             form.instruments.content, form.sensor_table.content = contents.get(form.drone.chosen, ("", ""))

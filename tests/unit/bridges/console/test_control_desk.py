@@ -76,7 +76,7 @@ def test_a_page_closed_while_it_is_drawn_does_not_affect_the_others():
     pages.open(1)
     pages.open(2)
     pages.figures[1].removed = True
-    forms.show([], {}, lambda drone: f"figures of {drone}", [])
+    forms.show([], {}, lambda drones: {drone: f"figures of {drone}" for drone in drones}, [])
     assert (pages.figures[1].shown, pages.figures[2].shown) == ("", "figures of drone1")
     assert forms.chosen(1) == ""
     assert forms.chosen(2) == "drone1"
