@@ -215,7 +215,7 @@ def test_a_reference_to_the_place_of_a_formation_s_robot_is_refused() -> None:
     planned = planned_motion(free, free.clusters[0])
     assert planned is not None
     assert 4 < planned.from_s < 40
-    for robot, place in enumerate(planned.places(100.0).tolist()):
+    for robot, place in enumerate(planned.positions(100.0).tolist()):
         with pytest.raises(ScenarioError) as refused:
             check_plans(with_formation(plan, **hold(place)), "t.yaml")
         assert has_terms(str(refused.value), "clusters[0].plan.target", "robot", str(robot + 1), "alone")

@@ -271,7 +271,7 @@ def test_a_run_whose_output_is_closed_ends_and_then_prints_lines(up: Any, board:
     with board:
         up._signals.reason = reason
         up._signals._hung_up()
-        up._look()
+        up._poll()
         outcome = up._supervisor.run()
         assert (outcome.reason, outcome.interrupted) == (reason, True)
         board.say("fetching")
