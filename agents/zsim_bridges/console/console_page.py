@@ -253,7 +253,7 @@ class PageForms:
 
     def use(self, client_id: int | None, drone: str) -> str:
         """Let a page take control of a drone's part of the run; return why it may not, empty if it may."""
-        return self._desk.use(client_id, self._part_of(drone)) if client_id is not None else ""
+        return self._desk.use(client_id, self._part_of(drone), drone) if client_id is not None else ""
 
     def move_rings(self, drones: DronePoses) -> None:
         self._update(lambda form: form.ring.move(drones, form.drone.chosen))
@@ -304,7 +304,7 @@ class PageForms:
 
         def control_refusal(drone: str, use: bool) -> str:
             part = self._part_of(drone)
-            return self._desk.use(client_id, part) if use else self._desk.refusal(client_id, part)
+            return self._desk.use(client_id, part, drone) if use else self._desk.refusal(client_id, part, drone)
 
         with shared.control_folder:
             control = ControlForm(gui, self._desk, client_id, shared.parts)

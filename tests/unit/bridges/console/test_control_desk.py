@@ -135,6 +135,17 @@ def test_one_page_is_in_control_and_the_others_see_it(desk: Desk):
     assert desk.refusal(4, "") == ""
 
 
+def test_a_refusal_of_a_drone_names_it_and_the_part_to_ask_for():
+    pages, desk = Pages(), ControlDesk(["main"])
+    server: Any = pages
+    forms = PageForms(server, MagicMock(), MagicMock(parts={}), NAMES, MagicMock(), desk, lambda _: RUN)
+    pages.open(1)
+    pages.open(2)
+    assert forms.use(1, "drone2") == ""
+    assert has_terms(forms.use(2, "drone2"), "operator 1", "time and faults", "drone2", "Control")
+    assert has_terms(desk.refusal(2, RUN), "operator 1", "time and faults", "Control")
+
+
 def test_control_is_requested_and_granted_or_kept(desk: Desk):
     desk.use(4, "main")
     desk.request(7, "main")
