@@ -173,9 +173,7 @@ class Coordinator(ABC):
         else:
             blocks = former.is_waited_for and former.is_missed
         if not is_known and not strangers.allows("join"):
-            refusal = Refusal(
-                "the number of newcomers", f"beyond {STRANGERS_MAX} at once", "must wait: one may join each second"
-            )
+            refusal = Refusal("newcomers", f"beyond {STRANGERS_MAX} at once", "must wait: one may join each second")
         elif not blocks and not changes.allows(counted):
             refusal = too_many(name)
         else:
