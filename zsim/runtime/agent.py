@@ -353,7 +353,7 @@ class AgentGroup(Agent):
     their stamp. The group takes the name of its last member, also the source of all messages but `AgentMessage`s.
 
     Args:
-        members: the agents; the last names the group, the others are in any order; each steps at the gates of its own period.
+        members: the agents, in any order but for the last; each steps at the gates of its own period.
         hold_ns: `output_hold_ns` of the run.
 
     Raises:

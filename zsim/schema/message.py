@@ -1,6 +1,6 @@
 """Messages: field types, the fields common to all messages, and users' declarations.
 
-Declarations name types independently of any programming language: number, number[3], whole, flag, text.
+Declarations name types independently of any programming language: number, number[3], number[], whole, flag, text.
 
     field_types(State, Message)  →  {"position_m": "number[3]", "leader": "flag"}
     declared_type("State", {"position_m": "number[3]", "leader": "flag"}, Message)
