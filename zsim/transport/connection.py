@@ -143,7 +143,7 @@ def find_world(
     """Yield a session and the `world/info` of its run.
 
     Raises:
-        NoWorldError: no world answered within `wait_s`, or `stopped` returned true.
+        NoWorldError: no world answered within `wait_s`, its answer is unusable, or `stopped` returned true.
         SessionError: waiting would not help: the endpoint is malformed, or the certificate refused or not admitted.
         BadNameError: the federation's name is outside the contract.
     """

@@ -424,6 +424,7 @@ class Session:
 
         Raises:
             SessionError: `key` is not a valid key, or the arguments cannot be encoded.
+            DecodeError: the answer is not a ControlAnswer.
         """
         try:
             payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
