@@ -411,7 +411,7 @@ class Session:
         return [ReceivedSample(reply.key, reply.payload) for reply in replies if reply.kind != "ERROR"]
 
     def get_surely(self, expression: str) -> list[ReceivedSample] | None:
-        """Return the last values of the keys that match an expression; None if a process did not reply in time."""
+        """Return the last values of the keys that match an expression; None if a process refused or was late."""
         replies = self.query(expression)
         if any(reply.kind == "ERROR" for reply in replies):  # Zenoh's own "Timeout" among them
             return None
@@ -424,6 +424,7 @@ class Session:
 
         Raises:
             SessionError: `key` is not a valid key, or the arguments cannot be encoded.
+            DecodeError: the answer is not a ControlAnswer.
         """
         try:
             payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
@@ -472,7 +473,7 @@ class Session:
         return [str(r.ok.key_expr).removeprefix(self._prefix) for r in replies if r.ok is not None]
 
     def on_link(self, callback: Callable[[bool], None]) -> None:
-        """Call back with True when a transport to another process opens and False when one closes."""
+        """Call back with True for each transport to another process, present or new, and with False when one closes."""
         listener = self._raw.info.declare_transport_events_listener(
             lambda event: callback(event.kind == zenoh.SampleKind.PUT), history=True
         )
