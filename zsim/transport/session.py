@@ -354,9 +354,10 @@ class Session:
             SessionError: it is not a key expression, or our certificate does not permit reading it.
         """
         self._check("read", expression)
-        self.reads.append(expression)
         with _key_errors(expression):
-            return self._keep(Subscription(self._raw, self._prefix, expression))
+            subscription = self._keep(Subscription(self._raw, self._prefix, expression))
+        self.reads.append(expression)
+        return subscription
 
     def subscribe_remote(self, without: tuple[str, ...]) -> Subscription:
         """Return a subscription to all messages of other sessions, except pictures and keys with these prefixes.
@@ -373,12 +374,12 @@ class Session:
             SessionError: it is not a key expression, or our certificate does not permit reading it.
         """
         self._check("read", expression)
-        self.reads.append(expression)
         with _key_errors(expression):
             subscriber = self._raw.declare_subscriber(
                 self._prefix + expression, lambda sample: callback(_raw_sample(sample, self._prefix))
             )
         self._keep(subscriber)
+        self.reads.append(expression)
 
         def undeclare() -> None:
             if self._declared.pop(id(subscriber), None) is not None:
