@@ -223,13 +223,13 @@ class Ros2Node:
         def reply(query: Query) -> None:
             try:
                 received = attachment_of(query.attachment)
-                response = answer(decode(query.payload, f"{kind}_Request"))
+                response = encode(answer(decode(query.payload, f"{kind}_Request")), f"{kind}_Response")
             except ValueError as error:
                 query.end()
                 context.refuse(name, str(error))
                 return
             attachment = Attachment(received.sequence, context.wall_ns(), received.gid)
-            query.reply_raw(key, encode(response, f"{kind}_Response"), attachment.packed())
+            query.reply_raw(key, response, attachment.packed())
 
         context.link.declare_queryable(key, reply, complete=True)
         context.link.declare_token(token)
@@ -259,7 +259,7 @@ class Publisher:
         """Send a message without ever waiting; a subscriber that is too slow loses it.
 
         Raises:
-            ValueError, OverflowError, struct.error: the message does not fit its type.
+            ValueError: a value does not fit its field.
         """
         payload = encode(message, self._kind)
         self._sent += 1
@@ -373,8 +373,15 @@ def message_class(name: str) -> Any:
 
 
 def encode(message: Any, name: str) -> bytes:
-    """Return a message in little-endian CDR."""
-    return bytes(_store.serialize_cdr(message, _rosbags_name(name), little_endian=True))
+    """Return a message in little-endian CDR.
+
+    Raises:
+        ValueError: a value does not fit its field.
+    """
+    try:
+        return bytes(_store.serialize_cdr(message, _rosbags_name(name), little_endian=True))
+    except Exception as error:  # the generated writer may raise any exception for invalid values
+        raise ValueError(f"is not a {name}: {error}") from error
 
 
 def decode(payload: bytes, name: str) -> Any:

@@ -5,7 +5,6 @@ is the only cost. The bridge never makes the world wait.
 """
 
 import math
-import struct
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -385,6 +384,6 @@ class SourceSubscriptions:
                     converted = publication.topic.convert(key, message)
                     if converted is not None:
                         publication.publisher.publish(converted)
-                except (ValueError, OverflowError, struct.error) as error:  # numbers out of range for the ROS type
+                except (ValueError, OverflowError) as error:  # numbers out of range for the ROS type
                     self._refuse(publication.topic.name, f"{key} does not fit it ({error})")
         return len(received)

@@ -82,6 +82,12 @@ def test_the_cdr_of_a_cluster_state_is_correct() -> None:
     assert rmw_zenoh.encode(state, "zsim_msgs/msg/ClusterState") == wanted.whole()
 
 
+@pytest.mark.parametrize("sec", [2**40, "now"])
+def test_a_value_that_does_not_fit_its_field_is_refused(sec: Any) -> None:
+    with pytest.raises(ValueError, match=r"std_msgs/msg/Header"):
+        rmw_zenoh.encode(header(sec, 0, "map"), "std_msgs/msg/Header")
+
+
 def test_an_empty_message_has_one_byte_on_the_wire() -> None:
     for name in ("std_msgs/msg/Empty", "std_srvs/srv/Trigger_Request"):
         assert rmw_zenoh.encode(rmw_zenoh.message_class(name)(), name) == bytes.fromhex("0001000000")
