@@ -90,6 +90,8 @@ def test_only_the_measured_section_of_the_page_is_replaced() -> None:
 def test_a_failed_contender_is_reported_with_its_error() -> None:
     with refused(RefusedError, "code 1", "ValueError: no"):
         result([sys.executable, "-c", "raise ValueError('no')"], 30.0)
+    with refused(RefusedError, "code 3", "too late"):
+        result([sys.executable, "-c", "import sys; print('{}'); print('too late', file=sys.stderr); sys.exit(3)"], 30.0)
     with refused(RefusedError, "0.2 s"):
         result([sys.executable, "-c", "input() if False else __import__('time').sleep(60)"], 0.2)
 
