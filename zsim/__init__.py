@@ -1,8 +1,9 @@
 """The code shared by all processes of a federation: frames, keys, messages, scenario, record, session, agent.
 
-Packages from the bottom up: errors; math and schema; sensors; contract; vehicles; record, scenario and transport, which
-do not import each other; runtime; presentation. Each imports only those below it, and none imports another package of
-the product: what users call as `zsim.run` etc. belongs to `zsim_api`, which is imported when first used.
+Modules and packages from the bottom up: errors and output_folder; math and schema; sensors; contract; vehicles; record,
+scenario and transport, which do not import each other; runtime; presentation. Each imports only those below it, and
+none imports another package of the product: what users call as `zsim.run` etc. belongs to `zsim_api`, which is imported
+when first used.
 """
 
 import importlib

@@ -133,16 +133,17 @@ class Simulation:
             seed: for this and later flights; None: as before.
             set: fields of the scenario by path, for this and later flights; None: as before.
         """
-        if seed is not None or set:
-            self.source = self.source.changed(seed=seed, set=set)
         if self._writer is not None:
             raise RunError("reset: this simulation is recorded, and a record holds one flight; use a new Simulation")
+        source = self.source.changed(seed=seed, set=set)
+        resolved = source.resolved  # raises ScenarioError before anything is changed
+        self.source = source
         for i, attributes in self._pristine.items():
             own = vars(self._own[i])
             own.clear()
             own |= copy.deepcopy(attributes)
         self._is_closed = False
-        self.scenario, own = with_agents(self.source.resolved, self._own)
+        self.scenario, own = with_agents(resolved, self._own)
         self._flight = flight = InProcessFlight(self.scenario, None, None, own, stock=self._stock, steered=True)
         self.info: Info = flight.info
         self.names = [drone.name for drone in self.scenario.drones]

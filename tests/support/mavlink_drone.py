@@ -28,10 +28,10 @@ M = TypeVar("M", bound=WireMessage)
 class FlownDrone:
     """A MAVLink vehicle and its drone, which follows commands without delay."""
 
-    def __init__(self, autopilot: str = "px4") -> None:
+    def __init__(self, autopilot: str = "px4", scenario: str = SCENARIO) -> None:
         self.commands: list[Any] = []
         sender = CommandSender("drone1", OWN, lambda _, command: self.commands.append(command))
-        (drone,) = scenario_file.from_text(SCENARIO).drones
+        (drone,) = scenario_file.from_text(scenario).drones
         self.vehicle = MavlinkVehicle(
             drone, ORIGIN, sender, Options(1, PERSONALITIES[autopilot], "normal", OWN, UNIQUE_ID)
         )

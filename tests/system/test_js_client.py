@@ -219,7 +219,7 @@ def test_the_page_shows_why_a_command_is_refused(federation: Federation, opened:
     seen = opened(GatewayProcess(federation, *TOKEN))
     seen.wait_for_text(r"^landed$")
     seen.press("Hold drone1")
-    seen.wait_for_text("is landed; a setpoint needs it hovering or flying")
+    seen.wait_for_text("is landed; it accepts setpoints only while hovering or flying")
     assert seen.faults == []
 
 

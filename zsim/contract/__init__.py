@@ -1,5 +1,5 @@
 """The contract: which messages are published on which keys, how they are encoded, and what makes runs comparable.
 
-`keys`, `flight_messages` and `run_messages` declare all of it; `messages` encodes and decodes. Imports sensors and
-schema.
+`keys`, `flight_messages`, `run_messages` and `messages` declare its keys; `messages` also encodes and decodes. Imports
+sensors, schema and math.
 """

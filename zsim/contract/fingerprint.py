@@ -29,13 +29,13 @@ BUFFER_BYTES = 16_384  # bytes hashed at once, which takes no longer than a few 
 
 @cache
 def parts() -> dict[str, str]:
-    """Return the determinants of a flight's bits: versions of zsim and the contract, and a hash of the sources."""
+    """Return the versions of zsim, which `fingerprint` omits, and of the contract, and a hash of the sources."""
     return {"zsim": __version__, "contract": str(CONTRACT), "code": _code()}
 
 
 @cache
 def fingerprint() -> str:
-    """Return 16 hex digits; equal fingerprints guarantee bit-identical flights."""
+    """Return 16 hex digits; if equal, the same scenario, seed and events give bit-identical flights."""
     text = ";".join(f"{name}={value}" for name, value in sorted(parts().items()) if name != "zsim")
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

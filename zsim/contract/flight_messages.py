@@ -107,7 +107,7 @@ class Attitude(Command, frozen=True):
 class RotorSpeeds(Command, frozen=True):
     """Turn the rotors at these speeds, in the vehicle's order.
 
-    Four rotors in a cross are in the order front left, front right, rear right, rear left.
+    Four rotors in an X configuration are in the order front left, front right, rear right, rear left.
     """
 
     speed_rad_s: Rotors
@@ -130,8 +130,9 @@ class LinkState(Message, frozen=True):
 
     `state`: `waiting` for the first datagram; `connected`, but disarmed: no command that starts or steers a motor is
     sent; `armed`; `lost` after silence. `peer` is the address whose datagrams are accepted. `age_ms` is the wall time
-    since its newest datagram, `loss_percent` the share of its recent datagrams that were lost, `clock_offset_ms` its
-    clock minus the driver's; each is None if unknown. `refused` counts datagrams that are invalid or from elsewhere.
+    since the peer's newest datagram, `loss_percent` the share of its recent datagrams that were lost, `clock_offset_ms`
+    its clock minus the driver's; these and `round_trip_ms` are None if unknown. `refused` counts datagrams
+    that are invalid or from elsewhere.
     """
 
     source: str
@@ -369,12 +370,12 @@ def length_fault(message: Struct, names: tuple[str, ...], length: int) -> str | 
 
 _ALL: frozenset[DroneState] = frozenset(get_args(DroneState))
 _RULES: dict[str, tuple[str, frozenset[DroneState]]] = {
-    "takeoff": ("a take-off needs it landed", frozenset({"landed"})),
-    "land": ("a landing needs it in the air", _ALL - {"landed", "emergency"}),
+    "takeoff": ("it must be landed to take off", frozenset({"landed"})),
+    "land": ("it must be in the air to land", _ALL - {"landed", "emergency"}),
     "emergency": ("", _ALL),
-    "reset": ("a reset needs an emergency", frozenset({"emergency"})),
+    "reset": ("only a drone in the emergency state can be reset", frozenset({"emergency"})),
 }
-_SETPOINT = ("a setpoint needs it hovering or flying", AIRBORNE)
+_SETPOINT = ("it accepts setpoints only while hovering or flying", AIRBORNE)
 
 
 def state_refusal(name: str, state: str, requested: str) -> str | None:
@@ -415,11 +416,11 @@ def truth_fault(truth: Truth, rotors: int) -> str | None:
     for name, limit, unit in limits:
         values: Sequence[float] = getattr(truth, name)
         if max(map(abs, values)) > limit:
-            return f"{name} is {_shown(values)}; each must be within {limit:g} {unit}"
+            return f"{name} is {_shown(values)}; each must be at most {limit:g} {unit} in magnitude"
     if abs(el.length(truth.orientation_wxyz) - 1.0) > UNIT_SLACK:
         return f"orientation_wxyz is {_shown(truth.orientation_wxyz)}; must be a quaternion of length 1"
     if len(truth.rotor_rad_s) != rotors:
-        return f"rotor_rad_s has {len(truth.rotor_rad_s)} speeds; must have {rotors}, as the drone has rotors"
+        return f"rotor_rad_s has {len(truth.rotor_rad_s)} speeds; must have {rotors}, one per rotor of the drone"
     return None
 
 

@@ -1,7 +1,7 @@
 """Many messages at once as bytes: those of a gate, written from rows of numbers, and several in one payload.
 
     @gate, @gate/{drone}   the world's messages about its drones at one gate         GateMessages
-    @batch                 [key, payload] of all messages through the hub, in order  encode_batch, decode_batch
+    @batch                 [key, payload] of the messages through the hub, in order  encode_batch, decode_batch
 
 If the messages of a gate were sent one by one, each would wake every reader and the hub. These keys are outside the
 contract and begin with `@`, which no wildcard of Zenoh matches: a subscriber to `**` receives only the single messages.
@@ -260,7 +260,7 @@ class Layouts:
         self.program = Program(ops, np.array(first), literals)
 
     def room(self, texts: TextTable) -> int:
-        """Return the maximum size of a message, including GAP [bytes]."""
+        """Return an upper bound on the size of a message, including GAP [bytes]."""
         longest = int(np.diff(texts.ends, prepend=0).max(initial=0))
         fixed = sum(size for op, _, size in self._ops if op == LITERAL)
         return GAP + fixed + self.floats * FLOAT_BYTES + self.ints * max(INT_BYTES_MAX, longest)
@@ -310,7 +310,7 @@ def write(program: Program, texts: TextTable, kind: int, ints: NDArray, bits: ND
     """Write one message into `out` at `start`; return its end. To be compiled by the caller.
 
     Args:
-        program: `program` of Layouts; words: its texts; kind: index of the message's class in the Layouts.
+        program: `program` of Layouts; texts: table of its texts; kind: index of the message's class in the Layouts.
         ints: the message's integers, (I,); bits: its floats as uint64, (F,).
         out: bytes (uint8), with at least `Layouts.room` of them from `start` on.
     """

@@ -28,7 +28,7 @@ FAULTS = "world/faults"
 CONTROL = "world/control"
 RADIO = "world/radio"
 VIEW_DRONES = "view/drones"
-BATCH = "@batch"  # all messages through the hub, see zsim.contract.framing
+BATCH = "@batch"  # all messages through the hub except views and pictures, see zsim.contract.framing
 GATE = "@gate"  # the world's messages about all drones at a gate
 ACCESS = "@access"  # a process's permissions under access control, see zsim.transport.tls
 
@@ -167,7 +167,7 @@ def estimates_view(process_name: str) -> str:
 
 
 def process(process_name: str, topic: str) -> str:
-    """Return a key of a process; `topic` is `join`, `done`, `snapshot`, `bye` or `health`."""
+    """Return a key of a process; `topic` is `join`, `done`, `snapshot`, `bye`, `health`, `replay` or `outputs`."""
     return f"process/{process_name}/{topic}"
 
 

@@ -40,7 +40,7 @@ from zsim.sensors.stock_sensors import Mag as Mag
 from zsim.sensors.stock_sensors import Sonar as Sonar
 
 _KEY = re.compile(r"([a-z][a-z0-9_]{0,31})/\{(drone|cluster|run)\}/([a-z][a-z0-9_]{0,31})")
-KEY_ALLOWED = "swarm/{drone}/state: a word, {drone}, {cluster} or {run}, and a word, of a-z 0-9 _"
+KEY_ALLOWED = "swarm/{drone}/state: a word, {drone}, {cluster} or {run}, and a word: a letter and up to 31 of a-z 0-9 _"
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 CONTRACT_WORDS = frozenset({"drone", "cluster", "process", "world", "view", "clock"})  # first words of contract keys
 
@@ -61,7 +61,7 @@ class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
 
     @classmethod
     def of(cls, thing: str = "*") -> str:
-        """Return the key on which the agent of a drone or cluster publishes; by default the expression for all agents.
+        """Return the key on which the agent of a drone, cluster or run publishes; by default the expression for all.
 
         Raises:
             ValueError: the class's key is invalid.
@@ -120,7 +120,7 @@ def message_info(kind: type[AgentMessage]) -> MessageInfo:
         raise ValueError(f"{kind.__name__}.key is {kind.key!r:.60}; {reserved}")
     info = MessageInfo(f"{parts[1]}/*/{parts[3]}", kind.__name__, field_types(kind, AgentMessage))
     if not info.is_sound():
-        raise ValueError(f"{kind.__name__}, or one of its fields, is not a valid name; must be at most 32 of a-z 0-9 _")
+        raise ValueError(f"{kind.__name__}, or a field, is misnamed; must be a letter and up to 31 of a-z 0-9 _")
     return info
 
 
@@ -137,7 +137,7 @@ def about(kind: type[AgentMessage]) -> str:
 
 PAYLOAD_MAX = 16_000_000  # bytes; a scenario of 1000 drones in world/info is below this
 REFUSALS = (ValueError, TypeError, RecursionError, OverflowError, MemoryError, msgspec.MsgspecError)
-"""Errors that a decoder raises for a foreign payload: wrong types, invalid UTF-8, endless maps."""
+"""Errors that a decoder raises for a foreign payload: wrong types, invalid UTF-8, excessive nesting."""
 
 
 class Origin(Struct, frozen=True):

@@ -36,7 +36,7 @@ class Waiting(Struct, frozen=True):
 def holding_up(state: str, waiting: Sequence[Waiting]) -> Sequence[Waiting]:
     """Return the awaited processes that block a run with its clock in `state`; if known, only the causes.
 
-    While the run is running, waits of up to SOON_S are normal and do not count.
+    Unless the state is `waiting`, waits of up to SOON_S are normal and do not count.
     """
     delayed = [each for each in waiting if state == "waiting" or each.since_wall_s > SOON_S]
     return [each for each in delayed if not each.held_by] or delayed
@@ -103,7 +103,7 @@ class Event(Message, frozen=True):
 class Join(Message, frozen=True):
     """A process joins the run; of several incarnations (random numbers), the newest counts.
 
-    `period_ns` is the interval of its dones: a multiple of the gate, 0 for never. `serves` names processes that need
+    `period_ns` is the interval of its dones: a multiple of the gate, 0 if not fixed. `serves` names processes that need
     not join, since this one replaces them. `slack_ns` is how far the world may be ahead of the dones of a process
     without a period, 0 for any distance.
     """
@@ -209,7 +209,9 @@ class ControlRequest(Struct, frozen=True):
 
 
 class ControlAnswer(Struct, frozen=True):
-    """The answer to a request: whether it was carried out, the error if not, and the result."""
+    """The answer to a request: whether it was carried out, the error if not, and the result.
+
+    `more` is the number of the next page of a replay; None if there is none."""
 
     ok: bool
     error: str = ""
@@ -223,7 +225,7 @@ class ControlAnswer(Struct, frozen=True):
 @on("cluster/*/request", writers="controller", is_output=True)
 @on("drone/*/request", writers="reference", is_output=True)
 class ClusterRequest(Message, frozen=True):
-    """A request accepted on `cluster/{c}/control` or `drone/{d}/control` before the outputs of the gate `t_ns`.
+    """A request answered on `cluster/{c}/control` or `drone/{d}/control` before the outputs of the gate `t_ns`.
 
     `source` is the requesting process; `error` is the reason for a refusal. `controller` is the process that answered.
     """
@@ -242,7 +244,7 @@ class ClusterRequest(Message, frozen=True):
 def _infinite_fault(field: str, value: Any) -> str | None:
     """Return the fault of a field with arbitrary content if it contains a number that is not finite."""
     infinite = next((number for number in _numbers(value) if not math.isfinite(number)), None)
-    return None if infinite is None else f"{field} holds {infinite}; must be finite numbers"
+    return None if infinite is None else f"{field} holds {infinite}; its numbers must be finite"
 
 
 def _numbers(value: Any) -> Iterator[float]:

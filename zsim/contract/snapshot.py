@@ -36,7 +36,7 @@ class _Array(msgspec.Struct, array_like=True):
 
 
 def pack(state: State) -> bytes:
-    """Return a state as bytes, equal for equal states; raise TypeError for values that are not allowed in a State."""
+    """Return a state as bytes, equal for equal states in equal order; raise one of REFUSALS if it is not a State."""
     return _ENCODER.encode(state)
 
 

@@ -34,7 +34,7 @@ def uniform(*what: object) -> float:
 
 
 _ROOT_2_PI = math.sqrt(2.0 * math.pi)
-_SIGMAS_MAX = 38.0  # standard deviations; beyond this, the density is below the smallest double
+_SIGMAS_MAX = 38.0  # standard deviations; beyond this, the density is below the smallest normal double
 
 
 @deferred(makes_arrays=False)

@@ -66,10 +66,10 @@ class GateCount:
 class Completeness(Struct, frozen=True):
     """What a record contains and what it lacks."""
 
-    gates: int = 0  # gates on record
+    gates: int = 0  # gates in the record
     gaps: tuple[GateGap, ...] = ()  # missing gates
     messages_missing: int = 0  # missing messages of the world by sequence number, including those of missing gates
-    ended: bool = True  # whether the end of the run is on record
+    ended: bool = True  # whether the record has the end of the run
     closed: bool = True  # whether its writer has closed it
     last_ns: int = 0  # time of the last gate
     damaged: tuple[str, ...] = ()  # unreadable parts, with their positions
@@ -92,7 +92,7 @@ class Completeness(Struct, frozen=True):
         elif self.messages_missing:
             faults.append(f"{self.messages_missing} messages of the world are missing")
         if not self.ended:
-            faults.append(f"the end of the run is not on record, which ends at {self.last_ns / 1e9:.2f} s")
+            faults.append(f"the end of the run is missing; the record ends at {self.last_ns / 1e9:.2f} s")
         if self.damaged:
             faults.append(f"damaged: {shown(self.damaged)}")
         if not self.closed:

@@ -64,7 +64,7 @@ class RecordReader:
     def __init__(self, path: str | Path) -> None:
         """Open a record and scan its chunks, without decompressing them.
 
-        Raises RecordError if the file does not exist, is not an MCAP file, or has a damaged channel name.
+        Raises RecordError if the file does not exist, is not an MCAP file, or has a damaged channel.
         """
         self.path = Path(path)
         self._counts: Counter[int] = Counter()
@@ -159,7 +159,7 @@ class RecordReader:
         )
 
     def differs(self) -> bool:
-        """Return whether a record was changed after its writer closed it; read the whole file.
+        """Return whether a record was changed after its writer closed it, by reading the whole file.
 
         Names of keys and indexes have no checksum of their own.
         """
@@ -177,7 +177,7 @@ class RecordReader:
         return None
 
     def last_chunk(self, key: str, is_it: Callable[[bytes], bool]) -> tuple[int, list[Recorded]] | None:
-        """Return the start of the chunk with the last matching message of a key, and the chunk's messages before that.
+        """Return the start of the chunk with the last matching message of a key, and the chunk's earlier messages.
 
         `is_it` returns whether a payload matches.
         """

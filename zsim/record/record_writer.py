@@ -225,7 +225,7 @@ class RecordWriter:
         self._file.close()
         self._error = (
             f"{self.path}: cannot be written further ({error.strerror}); "
-            f"the record is readable up to byte {self._end}, make room and run again"
+            f"the record is readable up to byte {self._end}; remove the cause and run again"
         )
         raise RecordError(self._error) from error
 
@@ -235,12 +235,12 @@ def _opened(path: Path, mode: str) -> FileIO:
     try:
         file = FileIO(path, mode)
     except FileExistsError as error:
-        raise RecordError(f"{path}: exists; a record is never overwritten, give another path") from error
+        raise RecordError(f"{path}: exists; a record is never overwritten: give another path") from error
     except OSError as error:
         raise RecordError(f"{path}: cannot be written ({error.strerror})") from error
     if not take_lock(file):
         file.close()
-        raise RecordError(f"{path}: another process writes it; end that process, or give another path")
+        raise RecordError(f"{path}: another process is writing it; end that process, or give another path")
     return file
 
 

@@ -1,1 +1,1 @@
-"""Agents and their runners, gate by gate, on Zenoh or on an in-memory bus. Imports transport and all below it."""
+"""Agents and their runners, gate by gate, on Zenoh or an in-memory bus. Imports scenario, transport and all below."""

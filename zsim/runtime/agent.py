@@ -129,7 +129,7 @@ class Agent(ABC):
         return any(not keys.is_sensor(key) and key not in self.gate_keys for key in self.reads)
 
     def update_faults(self, info: Info, faults: Faults) -> None:
-        """Receive the injected faults of the run; called before the first gate in which one of them acts."""
+        """Receive the injected faults of the run; called before each gate in which they change."""
         if self._links is None and faults.faults:
             self._links = Links(info, (self.name, *self.serves))
         if self._links is not None:
@@ -283,7 +283,7 @@ class Agent(ABC):
         """Repeat a request that the predecessor published on a key of `repeats`; called before the message's gate."""
 
     def checkpoint(self) -> State | None:
-        """Return the snapshot and the state common to all agents: sequence numbers and messages held by links."""
+        """Return the snapshot and the common state: sequence numbers and held messages; None without a snapshot."""
         own = self.snapshot()
         if self._is_own:
             try:
@@ -350,10 +350,10 @@ class AgentGroup(Agent):
 
     A member receives each message at the gate at which a separate process would: outputs of other members that close
     its gate (in their `writes` and its `gate_keys`) immediately; all others through the transport, `hold_ns` after
-    their stamp. The group takes the name of its last member, which is also the source of all its messages.
+    their stamp. The group takes the name of its last member, also the source of all messages but `AgentMessage`s.
 
     Args:
-        members: the agents, in any order; each steps at the gates of its own period.
+        members: the agents, in any order but for the last; each steps at the gates of its own period.
         hold_ns: `output_hold_ns` of the run.
 
     Raises:

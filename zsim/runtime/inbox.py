@@ -18,7 +18,7 @@ from zsim.errors import DecodeError
 GAP_MAX = 10  # maximum number of consecutive lost gates to request again; the world is never farther ahead of an agent
 ALWAYS_NS = -1  # before every gate
 NEVER_NS = 2**63 - 1  # after every gate
-KEYS_MAX = 200_000  # maximum keys with cached readers; 1000 drones have about 15 000, and any process may invent more
+KEYS_MAX = 200_000  # maximum number of keys with cached readers; 1000 drones have about 15 000, and others may add more
 Input = tuple[str, Any]
 """A key and its message, or `keys.GATE` and a `GateMessages`."""
 
@@ -52,14 +52,15 @@ class Inbox:
         # closing keys: a gate t is complete once each of them has a message with t_ns == t
         gate_keys: Sequence[str],
         counted: Sequence[str] = (),  # drones whose `sensor/*` messages are all awaited, as counted in their status
-        # whether a late message is delivered, once, with the next gate: in realtime an old input is better than none
+        # whether a late message, unless older than one delivered on its key, is delivered with the next gate: in
+        # realtime an old input is better than none
         keep_late: bool = False,
         # keys whose messages belong to no gate, such as detections in pictures; late ones are always delivered
         uncounted: Sequence[str] = (),
         # closing keys whose publishers, such as drivers of external drones, may skip gates; awaited until they do
         sparse: Sequence[str] = (),
-        # delivery delay of agents' outputs on keys that close no gate: command delay plus one gate, after which they
-        # have certainly arrived, so that the order of arrival is irrelevant
+        # delivery delay of agents' outputs on keys that close no gate, `output_hold_ns`: after it they have certainly
+        # arrived in lockstep, so that the order of arrival is irrelevant
         hold_ns: int = 0,
     ) -> None:
         self._closing = dict.fromkeys(gate_keys)
@@ -211,7 +212,7 @@ class Inbox:
     # Delivery
 
     def take(self, t_ns: int) -> list[Input]:
-        """Remove and return all inputs stamped up to t_ns, in order of (t_ns, key, seq)."""
+        """Remove and return all inputs stamped up to t_ns, in order of (t_ns, key, seq), late ones first."""
         ready: list[Input] = []
         for stamp in _pop_until(self._stamps, t_ns):
             stamped = self._waiting.pop(stamp)

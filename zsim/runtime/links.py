@@ -192,7 +192,7 @@ def position_of(
 ) -> Point | None:
     """Return the position of a process [m; W]: that in `places`, otherwise that of its drone, otherwise the origin.
 
-    `lookup` returns the position of a drone [m; W], None if unknown.
+    In `places`, a drone's name stands for its position. `lookup` returns that of a drone [m; W], None if unknown.
     """
     position = places.get(process, drone_of(process, drones) or fault_kinds.ORIGIN)
     return lookup(position) if isinstance(position, str) else position

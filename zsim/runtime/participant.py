@@ -33,7 +33,7 @@ ANOTHER_RUN = "the world has begun another run"
 REPLAY_S = 2.0  # wall-time limit of a replay; a hub answers within milliseconds, or never if the link is lost
 REJOINS_MAX = 6  # unanswered joins after which one is assumed to have arrived; a new router forwards nothing at first
 RETRY_S = 0.5  # wall time between attempts at an unanswered request to the world
-REQUESTS_MAX = 10  # maximum replays for a lost message, which may still be on its way to the world at the first
+REQUESTS_MAX = 10  # maximum number of replays for a lost message; at the first it may still be on its way to the world
 RESUME_NS = 4_000_000_000  # maximum simulated age of a usable snapshot: the world keeps 5 s of history
 GATES_KEPT = 2  # gates whose outputs are kept for queries, as the contract demands; more if the world runs ahead
 
@@ -53,7 +53,7 @@ class Participant:
         info: messages.Info,
         name: str,  # process name, role.thing
         serves: tuple[str, ...] = (),  # names of the processes that it replaces
-        # how far the world may be ahead of its last done; 0 for a process that the world does not wait for
+        # how far the world may be ahead of its last done; 0 for an agent, or if the world does not wait for the process
         slack_ns: int = 0,
         *,
         period_ns: int = 0,  # interval at which an agent reports done; 0 for other processes
@@ -62,7 +62,7 @@ class Participant:
         next_seq: Callable[[str], int] | None = None,
     ) -> None:
         self.name = name
-        # whether the world waits for this process, which must then subscribe to all its inputs before `announce`
+        # whether it reports done although it is no agent; it must then subscribe to all its inputs before `announce`
         self.gates = slack_ns > 0
         self.now_ns = 0  # simulated time of the newest clock message received
         self.done_ns = -1  # newest gate done; -1 before the first
@@ -112,7 +112,7 @@ class Participant:
         self.publish("join", self._membership.join(self.now_ns))
 
     def done(self, t_ns: int) -> None:
-        """Publish that all gates up to t_ns are done, if the world waits for this process."""
+        """Publish that all gates up to t_ns are done, if this process has `slack_ns`."""
         if self.gates:
             self.done_ns = max(self.done_ns, t_ns)
             self.publish("done", self._membership.done(t_ns, 0))

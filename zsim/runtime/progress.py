@@ -156,7 +156,7 @@ class PipedConsole(Console):
 
 
 class Screen:
-    """Shows progress live on a terminal; elsewhere, prints events and a line every ten simulated seconds.
+    """Shows progress live on a terminal; elsewhere, prints events, and a line per wait and per ten simulated seconds.
 
     Args:
         duration_s: simulated time at the end.

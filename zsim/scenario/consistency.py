@@ -528,7 +528,7 @@ def _path_faults(reference: Any) -> Iterator[Fault]:
     if paths and reference.start_s is None:
         yield "start_s", f"is missing; must say when {paths[0]} begins"
     if not paths and reference.start_s is not None:
-        yield "start_s", f"is {reference.start_s:g} without a path; must be left out, or with one of {', '.join(PATHS)}"
+        yield "start_s", f"is {reference.start_s:g} without a path; leave it out, or add one of {', '.join(PATHS)}"
     if _known(reference.start_s, reference.takeoff_s) and reference.start_s < reference.takeoff_s:
         yield "start_s", f"is {reference.start_s:g}; must be >= takeoff_s ({reference.takeoff_s:g})"
     for name in ("constants", "duration_s"):
@@ -544,7 +544,7 @@ def _path_faults(reference: Any) -> Iterator[Fault]:
 
 def _landing_faults(piloted: Any, from_s: float | None) -> Iterator[Fault]:
     if _known(piloted.land_s, from_s) and piloted.land_s <= from_s:
-        yield "land_s", f"is {piloted.land_s:g}; must be > {from_s:g}, until which it flies"
+        yield "land_s", f"is {piloted.land_s:g}; must be > {from_s:g}: after its take-off, path start or stages"
 
 
 def _piloted(scenario: Any, drones: _Entries) -> _Entries:

@@ -57,7 +57,7 @@ class FaultKind(NamedTuple):
     strikes: Target
     description: str  # its effect, for tables
     parameters: tuple[FaultParameter, ...] = ()
-    # "ends" requires `for_s`, "once" forbids it; "any" allows it; without it the fault lasts until cleared
+    # "ends" requires `for_s`, "once" forbids it; "any" allows it, and without it the fault lasts until cleared
     lasts: Literal["any", "ends", "once"] = "any"
     sensor: str = ""  # affected sensor, if any, which not every drone has
 

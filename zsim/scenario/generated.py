@@ -234,7 +234,7 @@ def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
         _refuse(path, where, f"ends in {kind or 'nothing'}", "must be .stl, .obj or .ply, or a height map .csv or .npy")
     if not len(triangles):
         size = path.stat().st_size
-        fault = f"of {size} bytes has no triangle that could be read"
+        fault = f"has {size} bytes, but no triangle that could be read"
         allowed = "; a binary STL has 84 bytes and 50 for each triangle" if kind == ".stl" else ""
         _refuse(path, where, fault, f"must have one or more{allowed}")
     if len(wrong := np.flatnonzero(~np.isfinite(triangles).all(axis=1))):

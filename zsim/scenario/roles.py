@@ -124,7 +124,7 @@ def check_pace(scenario: Scenario, mode: str) -> None:
     external = scenario.external()
     if external and mode != "realtime":
         subject = f"{listed(external)} {'is' if len(external) == 1 else 'are'} external"
-        needed = "it flies in wall time: run with --realtime, in separate processes"
+        needed = "external drones fly in wall time: run with --realtime, in separate processes"
         raise ScenarioError([f"{scenario.name}: body of {subject}, and the run is in {mode}; {needed}"])
 
 
@@ -231,7 +231,7 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
 
 
 def _granted_own(agent: OwnAgent, thing: str, scenario: Scenario) -> Rights:
-    """Return the rights of a user's agent: to read everything except the truth, and to command its own drones."""
+    """Return the rights of a user's agent: to read what agents read, to command its drones, to publish its messages."""
     drones = [drone.name for drone in scenario.drones]
     drones_by_scope = {"drone": [thing], "run": drones}
     own = drones_by_scope.get(agent.per) or scenario.cluster(thing).drones

@@ -285,7 +285,7 @@ class Environment(Spec, frozen=True, kw_only=True):
 class Silence(Spec, frozen=True, kw_only=True):
     """What the firmware does when the commander falls silent, in simulated time."""
 
-    hover_s: Positive = 0.5  # design choice: 25 gates; longer than any link delay, shorter than the time to a collision
+    hover_s: Positive = 0.5  # design choice: 25 gates; above usual link delays, shorter than the time to a collision
     land_s: Positive = 2.0  # further time until it lands; the AR.Drone's com_watchdog
 
 
@@ -427,7 +427,7 @@ class Processes(Spec, frozen=True, kw_only=True):
     start_timeout_s: Positive | UnsetType = UNSET
     """Wall time after which an expected process that has not joined is overdue; unset: see docs/scenario.md."""
     return_s: Positive | None = None  # wall time within which a process that may restart must rejoin
-    on_overdue: Annotated[dict[str, OnOverdue], Meta(max_length=PROCESSES_MAX)] | UnsetType = UNSET  # unset: end
+    on_overdue: Annotated[dict[str, OnOverdue], Meta(max_length=PROCESSES_MAX)] | UnsetType = UNSET  # unset: by role
     snapshot_s: Annotated[float, Meta(ge=0, le=3)] = 1.0  # simulated time; 0: none. The world keeps 5 s of messages
     gating: Annotated[list[Literal["camera"]], Meta(max_length=1)] | UnsetType = UNSET
     """Roles, other than those of agents, that the run waits for; unset: none."""
@@ -578,7 +578,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
     """Programs of users, by the name of the process; unset: none, and left out of the resolved text."""
     topology: Topology | UnsetType = UNSET
     radio: Radio | UnsetType = UNSET
-    """Unset: all agents hear each other; left out of the resolved text."""
+    """Unset: unlimited, and left out of the resolved text."""
     processes: Processes = Processes()
     faults: Annotated[list[dict[str, Any]], Meta(max_length=FAULTS_MAX)] = []
     """Faults to inject, each a map; `zsim.scenario.faults.flaws` checks them."""

@@ -382,7 +382,7 @@ def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
     try:
         if path.stat().st_size > BYTES_MAX:
             raise DocumentError(
-                [f"{where} is {show(str(path))}, which has more than {BYTES_MAX} bytes; must have less"]
+                [f"{where} is {show(str(path))}, which has more than {BYTES_MAX} bytes; must have at most that many"]
             )
         rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:

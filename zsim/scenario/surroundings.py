@@ -79,7 +79,7 @@ class Surroundings:
         self.is_empty = not self._obstacles and self._sheet is None
 
     def distances_m(self, p_W: ArrayLike) -> Array:
-        """Return the distance [m] of each point (P, 3) from the nearest one: negative in an obstacle, inf if empty."""
+        """Return the distances [m] of points (P, 3) from the nearest obstacle (negative inside) or surface, or inf."""
         distances = min_distances(self._obstacles, p_W)
         if self._sheet is not None:
             distances = np.minimum(distances, nearest_points(self._sheet, p_W, np.maximum(distances, 0.0))[0])

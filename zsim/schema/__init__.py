@@ -1,1 +1,1 @@
-"""Handwritten documents: reading within limits, type checks, and users' modules named in them. Imports errors."""
+"""Handwritten documents (limits, type checks, users' modules named in them) and message types. Imports errors."""

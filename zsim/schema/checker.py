@@ -15,8 +15,8 @@ from msgspec import inspect as types
 
 from zsim.errors import DocumentError
 
-SHOWN_MAX = 60  # maximum characters of a value shown in an error
-FAULTS_MAX = 100  # maximum faults listed; further ones are only counted
+SHOWN_MAX = 60  # maximum number of characters of a value shown in an error
+FAULTS_MAX = 100  # maximum number of faults listed; further ones are only counted
 COUNTED_MAX = 10_000  # maximum count of further faults: a document of 1 MB can have many more, and each takes time
 NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # type ranges, omitted from errors
 

@@ -1,6 +1,6 @@
 """Messages: field types, the fields common to all messages, and users' declarations.
 
-Declarations name types independently of any programming language: number, number[3], whole, flag, text.
+Declarations name types independently of any programming language: number, number[3], number[], whole, flag, text.
 
     field_types(State, Message)  →  {"position_m": "number[3]", "leader": "flag"}
     declared_type("State", {"position_m": "number[3]", "leader": "flag"}, Message)
@@ -71,7 +71,7 @@ def field_types(message: type[Struct], base: type[Struct], but: Collection[str] 
             words_allowed = ("number", "tuple or list of numbers", "whole number", "bool", "text")
             allowed = ", ".join(each for each in words_allowed if each not in but)
             annotation = getattr(message, "__annotations__", {}).get(field.name, "another type")
-            raise TypeError(f"{message.__name__}.{field.name} is {annotation!s:.60}; must be a {allowed}")
+            raise TypeError(f"{message.__name__}.{field.name} is {annotation!s:.60}; must be one of {allowed}")
         type_names[field.name] = type_name
     return type_names
 

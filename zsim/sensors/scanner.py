@@ -1,7 +1,7 @@
 """Messages and settings of sensors that measure distances along rays: range beams, lidars and depth cameras.
 
-The world casts the rays at the ground, obstacles and the hulls of other drones (zsim_world.sensors.scans). A drone has
-such a sensor only if the scenario has its section.
+The world casts the rays at the ground, obstacles, surfaces and the hulls of other drones (zsim_world.sensors.scans). A
+drone has such a sensor only if the scenario has its section.
 
 A distance of 0 means no echo: nothing is within range, or the echo was lost. Messages of the contract contain no
 infinities, and measured distances are above 0.

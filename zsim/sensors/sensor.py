@@ -111,7 +111,7 @@ class SensorTruth(Struct, frozen=True):
             The acceleration is that of the board's last step, at most 5 ms old.
         R_WB: rotation from body to world components, (3, 3).
         w_WB_B, alpha_B: body rate [rad/s] and its derivative [rad/s^2] in B, (3,).
-        air_W: velocity of the air at the drone in W [m/s], (3,): steady wind, gusts and other drones' wash.
+        air_W: velocity of the air at the drone in W [m/s], (3,): steady wind, gusts and other drones' downwash.
         p_BS, R_BS: position of the sensor in B [m], (3,), and rotation from sensor to body components, (3, 3).
     """
 

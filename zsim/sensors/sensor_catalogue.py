@@ -132,7 +132,9 @@ def _check(sensor: SensorType) -> None:
     if sensor.equation is None:
         raise ValueError("equation is missing; must be a function of truth, settings and environment")
     if not 1 <= sensor.values <= VALUES_MAX:
-        raise ValueError(f"channels have {sensor.values} numbers with the exact ones; must have 1 to {VALUES_MAX}")
+        raise ValueError(
+            f"channels have {sensor.values} numbers, including the exact ones; must have 1 to {VALUES_MAX}"
+        )
     for index, channel in enumerate(sensor.channels):
         if channel.settings not in sensor.settings.__struct_fields__:
             allowed = f"must be a field of {sensor.settings.__name__}"

@@ -73,7 +73,7 @@ def connect(
     endpoint: str,  # e.g. "tcp/192.168.1.2:7447"
     federation: str,
     mode: Mode = "lockstep",  # mode of the run, if known
-    wait_s: float | None = None,  # how long to keep trying; None: try once
+    wait_s: float | None = None,  # how long to keep trying; None: 0.5 s
     # whether the run never waits for it: even in lockstep, a silence of LEASE_READER_MS then counts as its death
     reader: bool = False,
     identity: Identity | None = None,  # host and certificate; by default this host's name and no TLS
@@ -92,7 +92,7 @@ def connect(
 
 
 def check_listening(endpoints: Sequence[str], identity: Identity | None = None) -> None:
-    """Raise SessionError, without listening, if an endpoint is malformed or does not match the identity."""
+    """Raise SessionError, without listening, if an endpoint is malformed, has port 0 or does not match the identity."""
     if any(endpoint.endswith(":0") for endpoint in endpoints):
         raise SessionError(f"cannot listen on {', '.join(endpoints)}: other processes cannot connect to port 0")
     identity = identity or Identity()
@@ -143,7 +143,7 @@ def find_world(
     """Yield a session and the `world/info` of its run.
 
     Raises:
-        NoWorldError: no world answered within `wait_s`, or `stopped` returned true.
+        NoWorldError: no world answered within `wait_s`, its answer is unusable, or `stopped` returned true.
         SessionError: waiting would not help: the endpoint is malformed, or the certificate refused or not admitted.
         BadNameError: the federation's name is outside the contract.
     """

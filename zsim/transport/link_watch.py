@@ -1,8 +1,8 @@
 """Limits the backlog of the hub's links: a stalled reader that the run does not wait for loses its link.
 
-On a full link Zenoh either drops messages or blocks the sender, and with it the run, for all readers of a key alike.
-Participants must lose nothing, so all messages block; a reader that the run does not wait for is therefore disconnected
-before its link is full, and kept out for a while if it reconnects and stalls repeatedly.
+On a full link Zenoh either drops messages or blocks the sender, and with it the run; which of the two can be chosen per
+key only, not per reader. Participants must lose nothing, so all messages block; a reader that the run does not wait for
+is therefore disconnected before its link is full, and kept out for a while if it reconnects and stalls repeatedly.
 
 Order of this file: the watch, the sessions of each process, the TCP connections of this process, and the local
 processes at their far ends.
@@ -50,7 +50,7 @@ COMMAND_MAX = 80  # characters shown of a command line
 
 
 class Awaited(NamedTuple):
-    """A process that the run waits for: its name and those of the processes it replaces, and the pid in its join."""
+    """A process that the run waits for: its name, those of processes it replaces, and the pid in its join message."""
 
     names: tuple[str, ...]
     pid: int
@@ -245,9 +245,9 @@ class Progress(NamedTuple):
 class LinkSockets:
     """The TCP connections of this process, by the address of their far end; callable from any thread.
 
-    Zenoh does not expose them, and lets sockets linger for 10 s when it closes them itself, such as that of a stopped
-    process in realtime; this blocks the thread that also forwards messages. So lingering is disabled on every socket
-    found here. Connections are only found on Linux.
+    Zenoh does not expose them, and lets a socket linger for 10 s when it closes the socket itself, such as that of a
+    stopped process in realtime; this blocks the thread that also forwards messages. So lingering is disabled on every
+    socket found here. Connections are only found on Linux.
     """
 
     def __init__(self) -> None:
@@ -321,7 +321,7 @@ def local_socket(address: str) -> str:
     host, _, port = address.rpartition(":")
     host = host.strip("[]")
     packed = socket.inet_pton(socket.AF_INET6 if ":" in host else socket.AF_INET, host)
-    words = struct.unpack(f"={len(packed) // 4}I", packed)  # as in the tables: 32-bit words in the machine's order
+    words = struct.unpack(f"={len(packed) // 4}I", packed)  # as in the tables: 32-bit words in the machine's byte order
     end = "".join(f"{word:08X}" for word in words) + f":{int(port):04X}"
     for table in TABLES:
         with suppress(OSError), open(table, encoding="ascii") as lines:

@@ -354,9 +354,10 @@ class Session:
             SessionError: it is not a key expression, or our certificate does not permit reading it.
         """
         self._check("read", expression)
-        self.reads.append(expression)
         with _key_errors(expression):
-            return self._keep(Subscription(self._raw, self._prefix, expression))
+            subscription = self._keep(Subscription(self._raw, self._prefix, expression))
+        self.reads.append(expression)
+        return subscription
 
     def subscribe_remote(self, without: tuple[str, ...]) -> Subscription:
         """Return a subscription to all messages of other sessions, except pictures and keys with these prefixes.
@@ -373,12 +374,12 @@ class Session:
             SessionError: it is not a key expression, or our certificate does not permit reading it.
         """
         self._check("read", expression)
-        self.reads.append(expression)
         with _key_errors(expression):
             subscriber = self._raw.declare_subscriber(
                 self._prefix + expression, lambda sample: callback(_raw_sample(sample, self._prefix))
             )
         self._keep(subscriber)
+        self.reads.append(expression)
 
         def undeclare() -> None:
             if self._declared.pop(id(subscriber), None) is not None:
@@ -411,7 +412,7 @@ class Session:
         return [ReceivedSample(reply.key, reply.payload) for reply in replies if reply.kind != "ERROR"]
 
     def get_surely(self, expression: str) -> list[ReceivedSample] | None:
-        """Return the last values of the keys that match an expression; None if a process did not reply in time."""
+        """Return the last values of the keys that match an expression; None if a process refused or was late."""
         replies = self.query(expression)
         if any(reply.kind == "ERROR" for reply in replies):  # Zenoh's own "Timeout" among them
             return None
@@ -424,6 +425,7 @@ class Session:
 
         Raises:
             SessionError: `key` is not a valid key, or the arguments cannot be encoded.
+            DecodeError: the answer is not a ControlAnswer.
         """
         try:
             payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
@@ -472,7 +474,7 @@ class Session:
         return [str(r.ok.key_expr).removeprefix(self._prefix) for r in replies if r.ok is not None]
 
     def on_link(self, callback: Callable[[bool], None]) -> None:
-        """Call back with True when a transport to another process opens and False when one closes."""
+        """Call back with True for each transport to another process, present or new, and with False when one closes."""
         listener = self._raw.info.declare_transport_events_listener(
             lambda event: callback(event.kind == zenoh.SampleKind.PUT), history=True
         )

@@ -28,7 +28,7 @@ PROBE_S = 2.0  # timeout of each step of the handshake; a running listener answe
 LATE_S = 1.0  # in TLS 1.3 a server checks the client's certificate after the client has finished
 NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME, openssl/x509_vfy.h
 NETWORKED = ("tcp", "udp", "ws")  # unencrypted protocols in Zenoh's wheel that leave the machine
-REMEDY = "make new ones with zsim certs init"
+REMEDY = "make new certificates with zsim certs init"
 RENEW = f"{REMEDY} --renew"
 ADDRESS_REMEDY = f"name that in the hosts file and {REMEDY}, or connect to another address"
 Act = Literal["publish", "read", "ask"]
@@ -46,7 +46,7 @@ class Identity(NamedTuple):
 
     host: str = socket.gethostname()  # name in its messages
     tls: Path | None = None  # folder with ca.pem, certificate.pem and key.pem; None: without TLS
-    access: Path | None = None  # file with Zenoh's access control, for a listening process; None admits all
+    access: Path | None = None  # file with Zenoh's access-control rules, for a listening process; None admits all
     insecure: bool = False  # whether links may leave the machine without TLS
     process: str = ""  # required name in the certificate; empty: any
 
@@ -62,7 +62,7 @@ def is_tls(endpoint: str) -> bool:
 
 
 def leaves_machine(endpoint: str) -> bool:
-    """Whether unencrypted links of an endpoint use a network; False for a malformed endpoint."""
+    """Whether an endpoint's links may leave this machine unencrypted, as to any host name other than localhost."""
     protocol, _, address = endpoint.partition("/")
     host = (address.rpartition(":")[0] or address).strip("[]")
     if protocol not in NETWORKED or host == "localhost":
@@ -91,7 +91,7 @@ def own_fault(identity: Identity) -> str | None:
     actual, expected = _name(certificate), identity.process
     if expected in ("", actual):
         return None  # otherwise access control would drop everything that this process sends
-    return f"{identity.tls}: the certificate is for {actual}; must be for {expected}; give --tls the folder of that"
+    return f"{identity.tls}: the certificate is for {actual}; must be for {expected}; give the right --tls folder"
 
 
 def own_name(identity: Identity) -> str:

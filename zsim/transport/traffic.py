@@ -15,7 +15,7 @@ Passed = ReceivedSample | GateMessages
 
 
 class Traffic:
-    """All messages except views, in the order in which they passed the hub.
+    """All messages except views and pictures, in the order in which they passed the hub.
 
     Args:
         table: keys of the world's messages about the run's drones, see `run_key_table`.

@@ -57,7 +57,7 @@ def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
         "connect/retry": f"{{period_init_ms: {CONNECT_RETRY_MS}, period_max_ms: {2 * CONNECT_RETRY_MS}}}",
         "transport/link/tx/lease": str(lease),
         "transport/shared_memory/enabled": "false",  # on by default; needs /dev/shm, and leaves segments there
-        "timestamping/enabled": "false",  # a router's default; messages have their own time
+        "timestamping/enabled": "false",  # on by default in routers; messages have their own time
         _CLOSE_AFTER: str(CLOSE_AFTER_US),
     }
 
@@ -173,7 +173,7 @@ def launcher_files(roles: int, names: int) -> int:
     """Return the largest number of open files needed by a process of a run: its hub or its launcher.
 
     Args:
-        roles: started processes, including the world.
+        roles: number of started processes, including the world.
         names: number of processes that the world waits for, possibly more than are started.
     """
     return max(hub_files(max(roles - 1, names)), SESSION_FILES + ROLE_FILES * roles)

@@ -227,7 +227,7 @@ def vehicle_of(model: str, where: str = "model") -> Vehicle:
 
 
 def cross_layout(arm_m: float) -> tuple[Rotor, ...]:
-    """Return four rotors in a cross, the first and third clockwise: front left, front right, rear right, rear left."""
+    """Return four rotors in an X, the first and third clockwise: front left, front right, rear right, rear left."""
     xy = arm_m / math.sqrt(2.0)
     corners = {"front_left": (xy, xy), "front_right": (xy, -xy), "rear_right": (-xy, -xy), "rear_left": (-xy, xy)}
     turns: tuple[Literal[-1, 1], ...] = (1, -1, 1, -1)

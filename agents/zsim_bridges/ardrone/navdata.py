@@ -224,9 +224,10 @@ def unpack(datagram: bytes) -> Navdata:
         if offset + OPTION_HEADER.size > len(datagram):
             raise NavdataError("has no checksum")
         tag, size = OPTION_HEADER.unpack_from(datagram, offset)
-        if size < OPTION_HEADER.size or offset + size > len(datagram):
-            beyond = f"which is below 4 or beyond the packet's {len(datagram)} bytes"
-            raise NavdataError(f"option {tag} at byte {offset} has the size {size}, {beyond}")
+        smallest, largest = OPTION_HEADER.size, len(datagram) - offset
+        if not smallest <= size <= largest:
+            allowed = f"at least {smallest}" if size < smallest else f"at most {largest}"
+            raise NavdataError(f"option {tag} at byte {offset} has {size} bytes; must have {allowed}")
         if tag == CHECKSUM_TAG:
             if size != _CHECKSUM.size:
                 raise NavdataError(f"the checksum's size is {size}; must be {_CHECKSUM.size}")

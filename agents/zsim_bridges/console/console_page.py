@@ -5,7 +5,7 @@ drones, and its own list of events.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
@@ -253,7 +253,7 @@ class PageForms:
 
     def use(self, client_id: int | None, drone: str) -> str:
         """Let a page take control of a drone's part of the run; return why it may not, empty if it may."""
-        return self._desk.use(client_id, self._part_of(drone)) if client_id is not None else ""
+        return self._desk.use(client_id, self._part_of(drone), drone) if client_id is not None else ""
 
     def move_rings(self, drones: DronePoses) -> None:
         self._update(lambda form: form.ring.move(drones, form.drone.chosen))
@@ -262,15 +262,15 @@ class PageForms:
         self,
         rows: Sequence[DroneRow],
         metrics: Mapping[str, FlightMetrics],
-        sensors_of: Callable[[str], str],
+        sensors_of: Callable[[Collection[str]], Mapping[str, str]],
         events: Sequence[EventRow],
     ) -> None:
         """Show on each page the sorted and filtered drones, the figures of the chosen one, and the filtered events.
 
-        `sensors_of` returns the table of a drone's sensors as HTML.
+        `sensors_of` returns the table of each drone's sensors as HTML, by drone.
         """
         chosen = {form.drone.chosen for form in list(self._forms.values())}
-        contents = {drone: (metric_lines(metrics.get(drone)), sensors_of(drone)) for drone in chosen}
+        contents = {drone: (metric_lines(metrics.get(drone)), table) for drone, table in sensors_of(chosen).items()}
 
         def show(form: _PageForm) -> None:
             form.instruments.content, form.sensor_table.content = contents.get(form.drone.chosen, ("", ""))
@@ -304,7 +304,7 @@ class PageForms:
 
         def control_refusal(drone: str, use: bool) -> str:
             part = self._part_of(drone)
-            return self._desk.use(client_id, part) if use else self._desk.refusal(client_id, part)
+            return self._desk.use(client_id, part, drone) if use else self._desk.refusal(client_id, part, drone)
 
         with shared.control_folder:
             control = ControlForm(gui, self._desk, client_id, shared.parts)

@@ -415,7 +415,7 @@ class RunPage:
         page.refresh(run)
         self.desk.release_lost()
         self._page_forms.refresh(run, page.chosen)
-        rows, sensors_of = self._table_rows.drone_rows(), self._table_rows.sensor_table
+        rows, sensors_of = self._table_rows.drone_rows(), self._table_rows.sensor_tables
         self._page_forms.show(rows, metrics, sensors_of, self.views.log.rows())
         page.phases.content = console_tables.formation_lines(run.phases)
         watch = self._monitor.fault_watch

@@ -109,8 +109,12 @@ class TableRows:
             rows.append(DroneRow(drone, fixes, own_faults, link, self._severity_of(name)))
         return rows
 
-    def sensor_table(self, drone: str) -> str:
-        """Return the table of one drone's sensors."""
+    def sensor_tables(self, drones: Collection[str]) -> dict[str, str]:
+        """Return the table of each drone's sensors by drone; the rates of other drones are no longer followed."""
+        self._rates.keep(drones)
+        return {drone: self._sensor_table(drone) for drone in drones}
+
+    def _sensor_table(self, drone: str) -> str:
         received, own_rates = self._views.estimates().get(drone), self._own_rates.get(drone, {})
         if received is None:
             return sensor_table(drone, {}, {}, "no estimate yet", own_rates)
@@ -123,26 +127,29 @@ class TableRows:
 
 
 class SensorRates:
-    """Derives one drone's sensor rates from irregular samples of its estimator's counts; another drone restarts it."""
+    """Derives the sensor rates of drones from irregular samples of their estimators' counts."""
 
     def __init__(self) -> None:
-        self._drone = ""
-        self._samples: list[tuple[int, Counts]] = []
+        self._samples: dict[str, list[tuple[int, Counts]]] = {}
+
+    def keep(self, drones: Collection[str]) -> None:
+        """Forget the samples of all other drones."""
+        self._samples = {drone: samples for drone, samples in self._samples.items() if drone in drones}
 
     def update(self, drone: str, t_ns: int, counts: Counts) -> dict[str, float]:
         """Add the counts of a drone's sensors at simulated time t_ns; return the latest rates [Hz]."""
-        if self._samples:
-            last_ns, last = self._samples[-1]
+        samples = self._samples.setdefault(drone, [])
+        if samples:
+            last_ns, last = samples[-1]
             restarted = any(sum(counts.get(kind, (0, 0))) < sum(before) for kind, before in last.items())
-            if drone != self._drone or t_ns < last_ns or restarted:  # the estimator restarted, or a replay was rewound
-                self._samples = []
+            if t_ns < last_ns or restarted:  # the estimator restarted, or a replay was rewound
+                samples.clear()
             elif t_ns == last_ns:
-                self._samples.pop()  # the run is paused
-        self._drone = drone
-        self._samples.append((t_ns, dict(counts)))
-        while len(self._samples) > 2 and t_ns - self._samples[1][0] >= SPAN_NS:
-            self._samples.pop(0)
-        since_ns, before = self._samples[0]
+                samples.pop()  # the run is paused
+        samples.append((t_ns, dict(counts)))
+        while len(samples) > 2 and t_ns - samples[1][0] >= SPAN_NS:
+            samples.pop(0)
+        since_ns, before = samples[0]
         span_ns = t_ns - since_ns
         if span_ns <= 0:
             return {}

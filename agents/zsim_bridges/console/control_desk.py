@@ -104,19 +104,21 @@ class ControlDesk:
                         holder, f"Control of {part_label(part)} was given to another page: this one was silent"
                     )
 
-    def refusal(self, page: int, part: str) -> str:
-        """Return why a page may not use a control of a part; empty if it may."""
+    def refusal(self, page: int, part: str, drone: str = "") -> str:
+        """Return why a page may not use a control of a part, or of a drone that belongs to it; empty if it may."""
+        held_with_it = f", hence of {drone}" if drone else ""
         with self._lock:
             for each in self.parts if part == ALL_PARTS else (part,):
                 holder = self._holders.get(each, page)
                 if holder != page:
-                    return f"{self.name_of(holder)} is in control of {part_label(each)}; ask for it under Control"
+                    label = f"{part_label(each)}{held_with_it}"
+                    return f"{self.name_of(holder)} is in control of {label}; ask for it under Control"
         return ""
 
-    def use(self, page: int, part: str) -> str:
-        """Give a page control of a free part; return why it may not use the part, empty if it may."""
+    def use(self, page: int, part: str, drone: str = "") -> str:
+        """Give a page control of a free part; return why it may not use the part, empty if it may; see `refusal`."""
         with self._lock:
-            refusal = self.refusal(page, part)
+            refusal = self.refusal(page, part, drone)
             if not refusal and part != ALL_PARTS and part not in self._holders:
                 self.open(page)
                 self._holders[part] = page

@@ -157,9 +157,10 @@ def _fenced(velocity_W: Vector, pose: DronePose, fence: Geofence) -> Vector:
     return turned_about_up(fence.limit_velocity(velocity_W, pose.p_W), -pose.yaw_rad)
 
 
-def _too_fast(rate: float) -> str:
+def _too_fast(rate: float, above: float = RATE_MAX) -> str:
+    """Return why nobody can fly manually at a rate; empty if it is not above the limit `above`."""
     slower = f"to fly by hand, set the rate to {RATE_MAX:g} or less"
-    return f"simulated time passes {rate:.1f} × as fast as wall time; {slower}" if rate > RATE_MAX else ""
+    return f"simulated time passes {rate:.1f} × as fast as wall time; {slower}" if rate > above else ""
 
 
 @dataclass
@@ -418,7 +419,7 @@ class ManualFlight:
         if flight.granted_s is not None and wall_s - flight.granted_s > SETTLED_S and status.commander != self._name:
             return f"{drone} is flown by {status.commander or 'nobody'} now"
         refusal = run.refusal or (run.silence if flight.granted_s is not None else "")
-        return refusal or _too_fast(run.rate / 2.0) or state_refusal(drone, status.state, "velocity") or ""
+        return refusal or _too_fast(run.rate, 2.0 * RATE_MAX) or state_refusal(drone, status.state, "velocity") or ""
 
     def _velocity(self, flight: _Flight, wall_s: float) -> VelocityCommand:
         pose, limits, stick = self._drone_status(flight.drone).pose, self._limits[flight.drone], flight.stick

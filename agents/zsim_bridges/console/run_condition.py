@@ -289,6 +289,7 @@ TILT_MAX_DEG = 30.0  # maximum tilt before take-off; design choice: above any sl
 LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
 LIMITS = EngagementLimits()  # limits within which a formation's controller lets its drones take off
 AT_END = "the record is at its end; go back on the timeline"
+NO_CLOCK = "waiting for the world's clock"
 WAITING_SHOWN_S = 2.0  # wall; a running world that has waited for a process for longer is shown as waiting
 NO_RUN = {"t_s": 0.0, "replay": False, "age_s": 0.0, "alarms": []}
 Level = Literal["no run", "waiting", "running", "paused", "emergency", "silent", "ended"]
@@ -423,9 +424,10 @@ class RunCondition(NamedTuple):
 
 
 def run_refusals(run: RunCondition) -> dict[str, str]:
-    outage, state = run.outage(), run.clock or "unknown"
-    running = "" if state == "running" else f"the run is {state}"
-    paused = "" if state == "paused" else f"the run is {state}, not paused"
+    outage, state = run.outage(), run.clock
+    unseen = "" if state else NO_CLOCK
+    running = "" if state == "running" else unseen or f"the run is {state}"
+    paused = "" if state == "paused" else unseen or f"the run is {state}, not paused"
     resume = outage or paused or (AT_END if run.at_end else "")
     return {"pause": outage or running, "resume": resume, "step": resume, "rate": outage, "seek": outage}
 
@@ -599,7 +601,7 @@ def no_run_head(world: str, ended: str = "") -> dict[str, Any]:
 def _waiting(clock: Clock | None, world: str) -> str:
     """Describe which processes the world is waiting for and, if some are absent, where they are expected."""
     if clock is None:
-        return "waiting for the world's clock"
+        return NO_CLOCK
     text = waiting_text(clock.state, clock.waiting_for)
     all_present = all(each.host for each in holding_up(clock.state, clock.waiting_for))
     return f"{text} in {world}" if world and not all_present else text

@@ -422,7 +422,7 @@ class SharedSubscriptions:
         """Call a subscriber with every publication on an expression until the returned function is called.
 
         Raises:
-            SessionError: the expression is invalid.
+            SessionError: the expression is invalid, or the gateway's certificate does not permit reading it.
             TooManyError: there are EXPRESSIONS_MAX other expressions already.
         """
         shared = self._by_expression.get(expression)
@@ -430,9 +430,10 @@ class SharedSubscriptions:
             check_expression(expression)
             if len(self._by_expression) >= EXPRESSIONS_MAX:
                 raise TooManyError(f"subscribe: there are {EXPRESSIONS_MAX} expressions already; use one of them")
-            shared = self._by_expression[expression] = _SharedSubscription(self._loop, self._waiting_max)
+            shared = _SharedSubscription(self._loop, self._waiting_max)
             if self._link is not None:
                 shared.undeclare = self._link.declare_subscriber(expression, shared.on_publication)
+            self._by_expression[expression] = shared
         shared.subscribers[subscriber] = None
 
         def unsubscribe() -> None:
@@ -451,7 +452,7 @@ class SharedSubscriptions:
         """Subscribe for a connection with a single subscription, and count it among the clients.
 
         Raises:
-            SessionError: the expression is invalid.
+            SessionError: see `subscribe`.
             TooManyError: the limit of clients or of expressions is reached.
         """
         self._limit.enter()

@@ -14,7 +14,7 @@ from zsim.math.rotation import LEVEL, Quaternion, Vector
 from zsim.scenario.scenario import Drone
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import SensorBit
-from zsim_bridges.vehicle_links.drone_link import has_attitude
+from zsim_bridges.vehicle_links.drone_link import BodyAxes, has_attitude
 
 ESTIMATE_AGE_MAX_NS = 500_000_000  # ns; an older estimate is not used
 MISSED_SAMPLES_MAX = 5  # periods without a sample after which a sensor counts as failed
@@ -39,10 +39,10 @@ class VehicleState:
 
     Attributes:
         t_ns: simulated time of the newest status.
-        position_m, velocity_m_s: in W; q_WB, rate_rad_s: attitude, and angular rate in the IMU's axes.
+        position_m, velocity_m_s: in W; q_WB, rate_rad_s: attitude, and angular rate in the body.
         is_estimated: whether position, velocity and attitude are the estimator's.
         sigma_m: standard deviations of the horizontal and the vertical position; 0 for the truth.
-        samples: newest sample of each sensor, by name.
+        samples: newest sample of each sensor, by name; those of the IMU and the magnetometer in body axes.
         home_m: home in W, initially where the vehicle was switched on; None before it is known.
     """
 
@@ -56,6 +56,7 @@ class VehicleState:
         self.is_estimated = False
         self.sigma_m = (0.0, 0.0)
         self.samples: dict[str, Any] = {}
+        self._axes = BodyAxes(drone.sensors.imu.mount, drone.sensors.mag.mount)
         self._new_samples: dict[str, list[Any]] = {}
         self.home_m: Vector | None = None
         self.origin = (origin.latitude_deg, origin.longitude_deg, origin.height_m)
@@ -88,6 +89,7 @@ class VehicleState:
                     horizontal, vertical = max(0.0, variances[0] + variances[7]), max(0.0, variances[14])
                     self.sigma_m = math.sqrt(horizontal / 2.0), math.sqrt(vertical)
             case _:
+                message = self._axes.converted(message)
                 self.samples[name] = message
                 self._new_samples.setdefault(name, []).append(message)
                 if isinstance(message, messages.Imu):

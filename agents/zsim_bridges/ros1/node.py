@@ -308,7 +308,9 @@ class RefusedError(ValueError):
 
 
 class SubscribedTopic:
-    """A topic that the node subscribes to, with a connection to each publisher, renewed unless it is refused.
+    """A topic that the node subscribes to, with a connection to each publisher.
+
+    A lost connection is renewed; a publisher that was refused is tried again when it is next announced, as in roscpp.
 
     Attributes:
         connected: names of connected publishers by the URI of their slave API.
@@ -358,7 +360,7 @@ class SubscribedTopic:
                             self._report_once(uri, str(error))
             except RefusedError as error:
                 self._report_once(uri, str(error))
-                return
+                break
             except (*CONNECTION_ERRORS, *master_api.CALL_ERRORS):
                 if uri in self._publishers:
                     await asyncio.sleep(pause_s)

@@ -294,7 +294,7 @@ std_msgs/Header header
 float32 battery_percent
 # 2 landed, 3 flying, 4 hovering, 6 taking off, 8 landing, 0 emergency
 uint32 state
-# in the axes of the magnetometer [uT]
+# [uT]
 float32 mag_x
 float32 mag_y
 float32 mag_z

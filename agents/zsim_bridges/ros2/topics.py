@@ -34,6 +34,7 @@ from zsim_bridges import ros_messages as ros
 from zsim_bridges.ros2 import rmw_zenoh
 from zsim_bridges.ros2.rmw_zenoh import CLOCK, DEFAULT, SENSOR, TF, Qos
 from zsim_bridges.ros_messages import NS_PER_S
+from zsim_bridges.vehicle_links.drone_link import BodyAxes
 
 MAP = "map"
 DRIVER = "ardrone"  # namespace of ardrone_autonomy's topics and services
@@ -185,7 +186,7 @@ def drone_topics(drone: str, name: str, sensors: Sensors) -> Iterator[Topic]:
     )
     yield Topic(f"/{name}/battery", "sensor_msgs/msg/BatteryState", DEFAULT, (status,), battery_on_change.update)
     yield Topic(f"/{name}/state", "std_msgs/msg/String", DEFAULT, (status,), state_on_change.update)
-    summary = NavdataSummary(base(name))
+    summary = NavdataSummary(base(name), BodyAxes(imu.mount, mag.mount))
     sources = (*(keys.sensor(drone, kind) for kind in keys.SENSORS if kind != "gps"), estimate, status)
     yield Topic(f"/{name}/navdata", "zsim_msgs/msg/Navdata", SENSOR, sources, summary.update)
 
@@ -260,7 +261,8 @@ class OnChange:
 class NavdataSummary:
     """Summarises a drone's newest samples as ardrone_autonomy's navdata, in its units, whenever a status arrives."""
 
-    def __init__(self, frame: str) -> None:
+    def __init__(self, frame: str, axes: BodyAxes) -> None:
+        self._axes = axes
         self._kind = rmw_zenoh.message_class("zsim_msgs/msg/Navdata")
         self._frame = frame
         self._last: dict[str, Any] = {}
@@ -269,7 +271,7 @@ class NavdataSummary:
         """Store a message of the drone; return the summary if the message is its status."""
         leaf = keys.leaf(key)
         if leaf != "status":
-            self._last[leaf] = message
+            self._last[leaf] = self._axes.converted(message)
             return None
 
         def scaled(sensor: str, field: str, factor: float) -> list[float]:

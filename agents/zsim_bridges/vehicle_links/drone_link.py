@@ -60,6 +60,27 @@ class CommandSender:
         self._put(key, message(t_ns, seq, self._source, *fields))
 
 
+class BodyAxes:
+    """Converts samples of the IMU and the magnetometer, whose poses in the body are given, to body axes."""
+
+    def __init__(self, imu: Mount | None = None, mag: Mount | None = None) -> None:
+        mounts = {messages.Imu: imu, messages.Mag: mag}
+        self._q_BS = {
+            kind: rotations.quaternion_from_rpy(np.radians(mount.rpy_deg))
+            for kind, mount in mounts.items()
+            if mount and any(mount.rpy_deg)
+        }
+
+    def converted(self, message: Any) -> Any:
+        """Return a sample in body axes; any other message unchanged."""
+        q_BS = self._q_BS.get(type(message))
+        if q_BS is None:
+            return message
+        names = [name for name in ("accel_m_s2", "gyro_rad_s", "field_ut") if hasattr(message, name)]
+        vectors = {name: tuple(rotations.rotate(q_BS, getattr(message, name)).tolist()) for name in names}
+        return msgspec.structs.replace(message, **vectors)
+
+
 class OnboardState:
     """The state of one aircraft: newest sensor samples, attitude, altitude, odometry.
 
@@ -77,12 +98,7 @@ class OnboardState:
     """
 
     def __init__(self, imu: Mount | None = None, mag: Mount | None = None) -> None:
-        mounts = {messages.Imu: imu, messages.Mag: mag}
-        self._q_BS = {
-            kind: rotations.quaternion_from_rpy(np.radians(mount.rpy_deg))
-            for kind, mount in mounts.items()
-            if mount and any(mount.rpy_deg)
-        }
+        self._axes = BodyAxes(imu, mag)
         self.imu: messages.Imu | None = None
         self.mag: messages.Mag | None = None
         self.baro: messages.Baro | None = None
@@ -98,8 +114,7 @@ class OnboardState:
 
     def update(self, message: Any) -> Any:
         """Process a message of the drone or of its estimator; return it in body axes."""
-        q_BS = self._q_BS.get(type(message))
-        message = message if q_BS is None else _rotated(message, q_BS)
+        message = self._axes.converted(message)
         match message:
             case messages.Imu():
                 previous, self.imu = self.imu, message
@@ -155,10 +170,3 @@ def has_attitude(estimate: flight_messages.Estimate) -> bool:
 def warm_up() -> None:
     """Compile or load the kernels before the first gate, which would otherwise wait for this."""
     madgwick_step(LEVEL, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), BETA_RAD_S, STEP_S_MAX)
-
-
-def _rotated(sample: Any, q_BS: np.ndarray) -> Any:
-    """Return a sample of the IMU or the magnetometer with its vectors in body axes."""
-    names = [name for name in ("accel_m_s2", "gyro_rad_s", "field_ut") if hasattr(sample, name)]
-    vectors = {name: tuple(rotations.rotate(q_BS, getattr(sample, name)).tolist()) for name in names}
-    return msgspec.structs.replace(sample, **vectors)

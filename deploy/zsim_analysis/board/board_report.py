@@ -151,7 +151,7 @@ def _paths(board: Board, first_seed_rows: dict[tuple[str, str], Row]) -> style.R
         panels[line, 0].set_ylabel(scenario.replace("_", " "), fontsize=style.PAPER_PT)
     caption = (
         "Seen from above, x to the right; each drone in its colour, with a dot where it was last in the air; dashed: "
-        "path of the reference's centre. All panels of a row have the same scale."
+        "path of the reference's centre. All panels of a row have the same scale. No path: the flight failed."
     )
     return style.ReportFigure("ways.png", "Paths of the drones, first seed", caption, figure)
 
@@ -186,7 +186,7 @@ def _shapes(board: Board, first_seed_rows: dict[tuple[str, str], Row]) -> style.
     descriptions = "; ".join(f"{each.replace('_', ' ')}: {about(each)}" for each in board.scenarios)
     caption = (
         "Root mean square distance of the drones from their desired positions, after the best fit of what the law "
-        "leaves open; "
-        f"laws without desired positions are not shown. {descriptions[0].upper()}{descriptions[1:]}."
+        "leaves open; laws without desired positions, or whose flight failed, are not shown. "
+        f"{descriptions[0].upper()}{descriptions[1:]}."
     )
     return style.ReportFigure("shapes.png", "Shape error over time, first seed", caption, figure)

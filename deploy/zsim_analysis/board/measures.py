@@ -103,6 +103,9 @@ def formation_track(
     p = np.stack([track.p_W[row[is_inside], :2] for track, row in zip(tracks, rows, strict=True)], axis=1)
     t_ns = t_ns[is_inside]
     for column, track in enumerate(tracks):
+        if not track.states:
+            p[:, column] = np.nan
+            continue
         latest = np.searchsorted(track.status_t_ns, t_ns, side="right") - 1
         aloft = np.array([state in AIRBORNE for state in track.states], bool)
         p[~aloft[np.maximum(latest, 0)], column] = np.nan

@@ -228,6 +228,20 @@ def test_a_stepped_flight_is_recorded(tmp_path: Path) -> None:
     assert flight.completeness.complete
 
 
+def test_a_refused_reset_leaves_the_scenario_unchanged(tmp_path: Path) -> None:
+    with zsim.Simulation(ONE, agents=None, record=tmp_path / "run") as sim:
+        source = sim.source
+        with refused(RunError, "record"):
+            sim.reset(seed=7)
+        assert sim.source is source
+    sim = zsim.Simulation(ONE, agents=None)
+    source = sim.source
+    with refused(ScenarioError, "drones[0].mass_kg is -1.4"):
+        sim.reset(set={"drones.d1.mass_kg": -1.4})
+    assert sim.source is source
+    sim.reset()
+
+
 def test_faults_of_a_scenario_are_reported_as_for_yaml() -> None:
     with refused(ScenarioError, "scenario: drones[0].mass_kg is -1.4", "> 0"):
         zsim.Simulation(ONE, set={"drones.d1.mass_kg": -1.4})

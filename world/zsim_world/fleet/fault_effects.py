@@ -52,7 +52,7 @@ class Impairment:
         self._steady = arrays.wind[WIND.steady : WIND.steady + 3].copy()
         self.rotors = {name: vehicle.rotor_names for name, vehicle in zip(drones, vehicles, strict=True)}
         self._sound = sound_actuators(len(drones), len(arrays.bodies.each))
-        self._held: dict[int, tuple[float, ...]] = {}  # speeds at which a fault holds its drone's rotors, by id
+        self._held: dict[int, tuple[float, ...]] = {}  # speeds of the rotors that a fault holds, by the fault's id
         self._gusts: tuple[Fault, ...] = ()
         self._calm = True
 
@@ -139,7 +139,7 @@ def _impair_scanner(row: NDArray[np.float64], effect: str, parameters: Mapping[s
 
 
 def dropped(limit: float, probability: float) -> float:
-    """Return the standard normal number below which a sample is lost; `limit` is that number without the fault."""
+    """Return the value of a standard normal variate below which a sample is lost; `limit`: that without the fault."""
     if probability == 1.0:
         return math.inf
     return normal_quantile(1.0 - (1.0 - normal_probability(limit)) * (1.0 - probability))

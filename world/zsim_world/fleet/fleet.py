@@ -86,11 +86,12 @@ _TAKES_SETPOINT = {mode for mode, state in enumerate(firmware.MODES) if state_re
 
 
 class DivergedError(RunError):
-    """The state of a drone is no longer finite; the text names the drone and the time."""
+    """The state of a drone is no longer finite, or is out of bounds; the text names the drone and the time."""
 
     def __init__(self, drone: str, t_s: float) -> None:
         super().__init__(
-            f"{drone} at {t_s:.3f} s: the state is no longer finite; check its mass, inertia, rotors and dt"
+            f"{drone} at {t_s:.3f} s: the state is no longer finite, or is out of bounds;"
+            " check its mass, inertia, rotors and dt"
         )
         self.drone = drone
 
@@ -122,7 +123,7 @@ class Fleet:
         observations: messages of sightings and scanners, by row of `sampled`.
         closest_m: smallest distance between two drones during the last gate [m]; inf for a single drone.
         collisions: pairs of drones whose hulls began to touch in the last gate.
-        touching: whether a drone's hull touched another's in the last gate, (N,).
+        touching: whether a drone's hull touched another's, an obstacle or a surface in the last gate, (N,).
     """
 
     SAVED: ClassVar[Saved] = {
@@ -190,7 +191,7 @@ class Fleet:
 
     @property
     def arrays(self) -> list[NDArray]:
-        """All arrays of the kernel except the near pairs of drones."""
+        """All arrays of the kernel except the near pairs of drones, the scene and the sheet."""
         return list(state_arrays(self._w))
 
     def restored(self) -> None:
@@ -202,7 +203,7 @@ class Fleet:
         """Integrate one gate with the current setpoints.
 
         Raises:
-            DivergedError: the state of a drone is no longer finite.
+            DivergedError: the state of a drone is no longer finite, or is out of bounds.
         """
         if self._gates % NOISE_GATES == 0:
             self._noise.refill()
@@ -267,12 +268,12 @@ class Fleet:
         return TrueState(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], accel, s[:, STATE.size :])
 
     def status(self, i: int) -> tuple[DroneState, float, bool]:
-        """Return the firmware's mode, the charge [%], and whether the hull touched another drone's in the last gate."""
+        """Return the firmware's mode, the charge [%], and whether the hull touched anything but the ground."""
         charge = 100.0 * self.bodies.energy.item(i) / self.bodies.vehicle.item(i, VEHICLE.capacity)
         return firmware.MODES[self._mode(i)], charge, bool(self.touching[i])
 
     def bumps(self) -> list[tuple[int, int]]:
-        """Return the contacts that began in the last gate, as pairs of indices of a drone and in `object_names`."""
+        """Return the contacts that began in the last gate: pairs of a drone's index and an index in `object_names`."""
         if not self.bodies.bumped.size:
             return []
         return [(int(i), int(m)) for i, m in np.argwhere(self.bodies.bumped)]
@@ -297,7 +298,7 @@ class Fleet:
             return f"{self.names[i]} has {charge:.1f} % of charge; a take-off needs {min_charge:g} %"
         x, y = self.boards.belief[i, BELIEF.q_WB + 1 : BELIEF.q_WB + 3]
         if 1.0 - 2.0 * (x * x + y * y) < UPRIGHT_COSINE:
-            return f"{self.names[i]} does not stand upright; a take-off needs it within 30 deg of level"
+            return f"{self.names[i]} does not stand upright; to take off, it must be within 30 deg of level"
         self._enter(i, firmware.TAKING_OFF)
         return None
 
@@ -456,7 +457,8 @@ class ExternalDrones:
     def command_refusal(self, i: int, kind: str, message: Any) -> str | None:
         """Return why a command is not passed on to the driver; None if it is.
 
-        A stop of the rotors is always passed on, other commands only if the newest state from the driver allows it.
+        A stop of the rotors is always passed on, other commands only if the newest state from the driver allows them
+        and their values fit the drone.
         """
         name, requested = self._fleet.names[i], message.mode if kind == "mode" else "setpoint"
         if requested == "emergency":

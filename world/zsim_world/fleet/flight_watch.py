@@ -89,7 +89,7 @@ class FlightWatch:
         return incidents
 
     def _own_mode(self, i: int, name: str) -> Incident:
-        """Return the incident that a drone's firmware has entered a mode by itself, with the reason."""
+        """Return the incident of a drone whose firmware has changed the mode of its own accord, with the reason."""
         if self._boards.memory[i, MEMORY.mode] == EMERGENCY:
             tilt_deg = math.degrees(el.acos(self._boards.setting[i, SETTING.tilt_cut]))
             text = f"{name} stops its rotors: it finds itself tilted by more than {tilt_deg:.0f} deg"
@@ -104,7 +104,7 @@ class FlightWatch:
 
 @inlined
 def watch(bodies: Bodies, memory: NDArray, watched: Watched, step: int) -> None:
-    """Add the incident bits of all drones in firmware step number `step` to those of the gate."""
+    """Add the incident bits of all simulated drones in firmware step number `step` to those of the gate."""
     seen, found = watched
     oldest = SEEN.v_WB + 3 * (step % IMPACT_STEPS)
     for i in range(found.size):

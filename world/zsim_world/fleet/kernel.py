@@ -1,8 +1,9 @@
 """The kernel: one gate of all drones, a pure function of its arrays.
 
 In every physics tick, in this order: the firmware (every 5 ms) reads the newest samples and commands the rotors; the
-drones are integrated, and the poses of external ones set; gusts advance (every 5 ms); contacts and downwash between
-drones are computed; the sensors that are due sample the new state.
+drones are integrated, and the poses of external ones set; gusts advance and batteries drain (every 5 ms); contacts with
+obstacles, surfaces and other drones, and downwash, are computed; incidents are detected (every 5 ms); the sensors that
+are due sample the new state.
 """
 
 import math
@@ -204,8 +205,8 @@ def advance(held: Held, ticks: int) -> tuple[int, float, int, bool]:
         held: the fleet's `Arrays`, wrapped by `zsim.math.held.hold`.
 
     Returns:
-        number of samples logged, smallest distance between two drones [m], index of a diverged drone or -1, whether
-            there was an incident.
+        number of samples logged (without those of users' sensors), smallest distance between two drones [m], index of a
+            diverged drone or -1, whether there was an incident.
     """
     return _advance(held.content, ticks)
 

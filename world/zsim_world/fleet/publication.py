@@ -28,7 +28,7 @@ from zsim_world.sensors.sampler import WHOSE, Sampled
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY
 
-MESSAGES = (  # in the order of KINDS
+MESSAGES = (  # in the order of their kinds' numbers
     *(kind.message for kind in STOCK.values()),
     (flight_messages.Truth, ROTORS_MIN),
     flight_messages.Status,
@@ -73,7 +73,7 @@ class PublishedArrays(NamedTuple):
 class PublishedState(NamedTuple):
     """The other published values of N drones."""
 
-    touching: NDArray[np.bool_]  # (N,), whether a hull touched another in this gate
+    touching: NDArray[np.bool_]  # (N,), whether a hull touched another, an obstacle or a surface in this gate
     sigma_m: NDArray[np.float64]  # (N,), standard deviation of each drone's GPS fixes
     commanders: NDArray[np.int64]  # (N,), number of the word that names each drone's commander
     counts: NDArray[np.int64]  # (N, kinds), messages published so far per key
@@ -216,7 +216,7 @@ class UserMessages:
             where = f"{self._fleet.names[i]}: sensors.{self._fleet.sensors.names[s]} at {stamps[0] / 1e9:.3f} s"
             if (failure := plugin.user_code_error(error, where)) is not None:
                 raise failure from error
-            text = f"its reading makes no {kind.message.__name__} ({reason_of(error)})"
+            text = f"its reading cannot be published as a {kind.message.__name__} ({reason_of(error)})"
             raise UserCodeError(text, where) from error
         return self._messages[s - STOCK_SENSORS](*stamps, *fields)
 

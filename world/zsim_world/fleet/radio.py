@@ -53,7 +53,7 @@ class RadioChannel:
 
         Args:
             position_m: positions of the drones in W, (N, 3).
-            faults: active faults; those of kind `radio` lower the reception of the drones that they target.
+            faults: active faults; those of kind `radio` lower reception on all links of the drones that they target.
         """
         radio, topology, n = self._radio, self._topology, self._count
         place_m = np.concatenate([position_m, self._station])

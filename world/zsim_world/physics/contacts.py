@@ -39,7 +39,7 @@ def gust_decay(length_m: float, airspeed_m_s: float, speed_min_m_s: float, dt: f
 
 @inlined
 def gust_noise(correlation: float, common: float, own: float) -> float:
-    """Return a standard normal number with the given correlation between drones."""
+    """Return a standard normal variate with the given correlation between drones."""
     return math.sqrt(correlation) * common + math.sqrt(1.0 - correlation) * own
 
 
@@ -50,7 +50,7 @@ def advance_gust(wind: Row, v_WB: Vector, gust: NDArray, common: Vector, own: Ve
     Args:
         wind: wind parameters (WIND.size,); load them once for many drones, so that square roots are computed once.
         v_WB: the drone's velocity [m/s].
-        common, own: standard normal numbers: shared by all drones, and this drone's own.
+        common, own: standard normal variates: shared by all drones, and this drone's own.
     """
     square = 0.0
     for k in range(3):
@@ -90,7 +90,7 @@ def downwash(thrust_n: float, density: float, start_m: float, below_m: float, as
     return core * el.exp(-ratio * ratio)
 
 
-DISTANCE_MIN_M = 1e-9  # m; lower bound, so that two drones at the same position have a direction between them
+DISTANCE_MIN_M = 1e-9  # m; lower bound, because two drones at the same position would cause a division by zero
 ROUNDING_MARGIN = 1.0 + 1e-9  # factor on a squared distance that covers any rounding error
 STRAY_M = 0.25  # m; displacement of a drone after which the near pairs are updated; 0.4 s at 0.6 m/s
 APPROACH_M = 0.501  # m; largest change of a pair's distance by then: twice STRAY_M, plus a margin for rounding
@@ -199,9 +199,10 @@ def _strayed(state: NDArray, origin: NDArray) -> bool:
 
 @inlined
 def _may_see(radius: float, eye: NDArray, aside: float, dz: float, distance: float) -> bool:
-    """Return whether a hull dz higher may enter a drone's downward view, a cone of limited range, until one strays.
+    """Return whether a hull dz above a drone may enter its downward view, a cone of limited range, until one strays.
 
     Args:
+        dz: negative if the hull is below the drone [m].
         eye: row of the looking drone in `NearPairs.eye`.
     """
     margin, cosine = radius + eye[0] + APPROACH_M, eye[2]

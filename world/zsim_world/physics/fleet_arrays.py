@@ -1,9 +1,9 @@
 """The arrays of a fleet, which the kernel reads and writes: a row for each of N drones, with room for R rotors.
 
-R is the largest number of rotors in the fleet. Numbers per rotor follow the columns of a row, R for each group; for a
-drone with fewer rotors the speeds and limits of the missing ones are zero. Compiled code takes R from `each`, a tuple
-of R numbers: it is compiled for each R, with unrolled loops over rotors. R is four only if all vehicles are four-rotor
-crosses, whose positions and mixing are then constants of the code; with any other four-rotor layout, R is five.
+R is the largest number of rotors in the fleet, but at least five unless all vehicles have four rotors in an X
+(`cross_layout`), whose positions and mixing are then constants of the code. Numbers per rotor follow the columns of a
+row, R for each group; for a drone with fewer rotors the speeds and limits of the missing ones are zero. Compiled code
+takes R from `each`, a tuple of R numbers: it is compiled for each R, with unrolled loops over rotors.
 """
 
 import math
@@ -102,7 +102,7 @@ STREAMS = columns("StreamColumns", (Field("sensors", "1", 6), Field("wind", "1")
 
 Row = NDArray[np.float64] | tuple[float, ...]  # row of one drone: an array view, or its values loaded into a tuple
 CROSS_ROTORS = 4
-# Groups of ROTOR for a cross of four rotors (zsim.vehicles.vehicle.cross_layout)
+# Groups of ROTOR for four rotors in an X (zsim.vehicles.vehicle.cross_layout)
 _X, _Y, _TURN = (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0)
 _ROLL, _PITCH, _YAW = (0.25, -0.25, -0.25, 0.25), (-0.25, -0.25, 0.25, 0.25), (0.25, -0.25, 0.25, -0.25)
 
@@ -136,7 +136,7 @@ class Bodies(NamedTuple):
     touching: NDArray  # int8 (N, N), 1 where hulls are in contact now
     touched: NDArray  # int8 (N, N), 1 where contact began in this gate
     near: NearPairs
-    obstacle: NDArray  # (M, obstacle.COLUMNS)
+    obstacle: NDArray  # (M, surroundings.COLUMNS)
     bumping: NDArray  # int8 (N, M + surfaces), 1 if more of a drone than its feet touches an obstacle or surface
     bumped: NDArray  # int8 (N, M + surfaces), 1 where such contact began in this gate
     solid: NDArray  # int32 (N, K), obstacles within reach; see physics/surfaces.py
@@ -165,7 +165,7 @@ class Boards(NamedTuple):
 
 
 class NoiseRows(NamedTuple):
-    """Standard normal numbers, a row per drone; the last row is for the wind that is common to all."""
+    """Standard normal variates, a row per drone; the last row is for the wind that is common to all."""
 
     table: NDArray  # (N + 1, all streams)
     at: NDArray  # int64 (STREAMS.size,), where each stream begins in a row

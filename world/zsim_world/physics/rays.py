@@ -1,7 +1,7 @@
 """Intersection of rays with ground, obstacles, triangles and drone hulls: exact, compiled, the same bits everywhere.
 
-Every convex solid is an intersection of slabs, or a quadric between two of them, so a ray is inside from the last entry
-to the first exit (Kay and Kajiya, SIGGRAPH 1986). Triangles: Moeller and Trumbore, J. Graphics Tools 2 (1997), both
+Every solid is convex, an intersection of slabs, a quadric or both, so a ray is inside from the last entry to the first
+exit (Kay and Kajiya, SIGGRAPH 1986). Triangles: Moeller and Trumbore, J. Graphics Tools 2 (1997), both
 sides. Obstacles and triangles are the leaves of one bounding volume hierarchy, traversed from near to far. Drones move
 and are few: a caster tests each ray against those within reach.
 """
@@ -167,7 +167,7 @@ def cast_hull(p_WB: Vector, q_WB: Quaternion, radius: float, o: Vector, d: Vecto
 
 @inlined
 def _box(bounds: NDArray, o: Vector, inverse_d: Vector, far: float) -> float:
-    """Return the distance at which a ray enters a box; `far` or more if not before."""
+    """Return the distance at which a ray enters a box; `far` if not before."""
     first, last = 0.0, far
     for k in range(3):
         a, b = (bounds[k] - o[k]) * inverse_d[k], (bounds[k + 3] - o[k]) * inverse_d[k]

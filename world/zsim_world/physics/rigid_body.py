@@ -252,7 +252,7 @@ GROUND_CLEARANCE_MIN = 0.5  # in rotor radii; smallest height for which the form
 
 @inlined
 def lagged(speed: float, command: float, decay: float) -> float:
-    """Return a rotor's speed [rad/s] after a first-order lag has decayed to the fraction `decay` = exp(-t / lag)."""
+    """Return a rotor's speed [rad/s] after its error has decayed to the fraction `decay` = exp(-t / lag)."""
     return command + (speed - command) * decay
 
 
@@ -322,7 +322,8 @@ def in_flow(
 ) -> tuple[Vector, Vector]:
     """Return the force [N] and moment [N m] in B due to flow past the rotors (zsim.vehicles.vehicle.Aerodynamics).
 
-    Translational lift is specified for rotors in flight; below the minimum speed it scales with the speed squared.
+    Translational lift is specified for rotors in flight; below a rotor's minimum speed it scales with the square of the
+    rotor's speed.
 
     Args:
         aero: (AERO.size,); u_B: velocity of the centre of mass relative to the air, in B [m/s].
@@ -369,7 +370,8 @@ def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: Per
         by_roll, by_pitch, _, _ = mixed(rotors, r)
         tilt_force = max(tilt_force, abs(by_roll * roll + by_pitch * pitch))
         min_lift, max_lift = min(min_lift, lift_share(rotors, r)), max(max_lift, lift_share(rotors, r))
-    # Find a mean with (low + reach) / least <= mean <= (high - reach) / most_lift; reduce the tilt until one exists.
+    # A mean must satisfy (low + tilt_force) / min_lift <= mean <= (high - tilt_force) / max_lift; reduce the tilt until
+    # one exists.
     margin = (high * min_lift - low * max_lift) * (2.0 / (min_lift + max_lift))
     scale = margin / (2.0 * tilt_force) if 2.0 * tilt_force > margin else 1.0
     roll, pitch, tilt_force = roll * scale, pitch * scale, tilt_force * scale
@@ -389,7 +391,10 @@ def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: Per
 
 @inlined
 def power(row: NDArray, speeds: PerRotor) -> float:
-    """Return the electric power [W] at given rotor speeds [rad/s]: of the shafts, sum of k_M w^3, and electronics."""
+    """Return the electric power [W] at given rotor speeds [rad/s].
+
+    It is the power of the shafts, the sum of k_M w^3, divided by the efficiency, plus that of the electronics.
+    """
     cubes = 0.0
     for r in range(len(speeds.each)):
         speed = value_of(speeds, 0, r)

@@ -187,7 +187,7 @@ def _put_state(lanes: NDArray, k: int, state: NDArray, each: tuple[int, ...]) ->
 def _load(bodies: Bodies, lanes: NDArray, first: int) -> bool:
     """Copy commands, air and forces into a block; return whether any of its drones is out of the ground's reach.
 
-    `first`: index of the block's first drone. Lanes without a drone hold arbitrary numbers, which are never read.
+    `first`: index of the block's first drone. The results of lanes without a drone are never read.
     """
     airborne, at = False, _group(BODY_ROTORS.command, bodies.each)
     for i in range(first, min(first + LANES, bodies.state.shape[0])):

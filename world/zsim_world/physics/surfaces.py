@@ -139,7 +139,7 @@ PLANE = columns(  # plane of a ball, at the nearest point of a surface
 class Touch(NamedTuple):
     """The contacts of one drone other than with the ground."""
 
-    obstacle: NDArray  # (M, obstacle.COLUMNS)
+    obstacle: NDArray  # (M, surroundings.COLUMNS)
     solid: NDArray  # int32 (K,), indices in `obstacle` of those within reach; -1: empty slot
     anchor: NDArray  # (K, BALLS, 3), anchors of the balls [m; W]
     plane: NDArray  # (BALLS, PLANE.size); (0, PLANE.size) where there are no surfaces

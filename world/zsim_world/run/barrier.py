@@ -1,8 +1,8 @@
 """The participants of the lockstep, their progress, and those that the world waits for.
 
 Pure bookkeeping without session or clock: wall times are passed in. To integrate from t, the world needs the done
-message of every gating participant for t minus the command delay. That of a participant with slack may be older by the
-slack.
+message of every gating participant for t minus the command delay, or for its last period before that. The done of a
+participant that does not gate but has slack may be older by the slack.
 """
 
 from collections.abc import Callable
@@ -138,7 +138,8 @@ class Barrier:
         """Admit a participant; return the refusal, or None.
 
         A new incarnation of a known name continues from the progress of the former one; likewise, a participant that
-        does all the work of dead participants replaces them and continues from theirs. Repeating a join has no effect.
+        does all the work of dead participants replaces them and continues from theirs. A repeated join only shows that
+        the participant is not away.
         """
         if refusal := self.join_refusal(name, message):
             return refusal
@@ -256,7 +257,7 @@ class Barrier:
         return participant is not None and participant.farewell is not None
 
     def retract_bye(self, name: str) -> Refusal | None:
-        """Drop the bye of a participant that continues, which another process has sent; return its refusal, or None."""
+        """Drop the bye that another process sent for a participant that continues; return its refusal, or None."""
         participant = self.participants[name]
         if participant.farewell is None:
             return None

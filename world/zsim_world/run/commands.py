@@ -1,8 +1,8 @@
 """Commands from arrival to firmware: checked, delayed by their link, queued, applied, published as events.
 
 The first source to send a setpoint to a drone without a commander becomes its commander, until it releases the drone,
-leaves or dies. Commands that take effect at the same time are ordered by (priority of the source, source, seq): the
-last one wins.
+leaves or dies, or another source acquires the drone. Commands that take effect at the same time are ordered by
+(priority of the source, source, seq): the last one wins.
 """
 
 from __future__ import annotations
@@ -214,7 +214,7 @@ class CommandIntake:
         """Release the drones commanded by a process that has left or died; they hover."""
         for i in self.queue.remove_source(source):
             self._release_drone(i)
-            self._outbox.event("release", self._fleet.names[i], f"{source} flies it no longer", source=source)
+            self._outbox.event("release", self._fleet.names[i], f"{source} no longer flies it", source=source)
 
     # Requests
 
@@ -237,7 +237,7 @@ class CommandIntake:
         if priority is None or not 0 <= priority <= PRIORITY_MAX:
             return refused_argument(request, "priority", f"from 0 to {PRIORITY_MAX}")
         if not request.source:
-            return Refusal("source", "empty", "must be the name under which the commands will come")
+            return Refusal("source", "empty", "must be the name of the source that will send the commands")
         return self.queue.acquire(index, request.source, int(priority))
 
     def _report_mission(self, request: ControlRequest, drone: str) -> Refusal | None:
@@ -344,7 +344,7 @@ class CommandQueue:
         return True
 
     def acquire(self, drone: int, source: str, priority: int) -> Refusal | None:
-        """Make the source the commander; return the refusal if the present commander's priority is not lower."""
+        """Make the source the commander; return the refusal if another commander's priority is not lower."""
         commander = self._commanders[drone]
         if commander is not None and commander.source != source and priority <= commander.priority:
             state = f"flown by {commander.source!r} with priority {commander.priority}"

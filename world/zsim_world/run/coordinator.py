@@ -27,8 +27,8 @@ from zsim_world.run.outbox import STRANGERS_MAX, Budgets, KeyedMessage, Refusal,
 from zsim_world.run.run_clock import Operation, RunClock, RunStatistics, number
 
 RECORDER = "recorder"  # name and role
-START_TIMEOUT_S = 60.0  # wall time to join for expected processes that the launcher does not start
-START_TIMEOUT_OWN_S = 600.0  # wall time to join for processes that the launcher starts; compiling may take minutes
+START_TIMEOUT_S = 60.0  # wall time within which expected processes that the launcher does not start must join
+START_TIMEOUT_OWN_S = 600.0  # the same for processes that the launcher starts; compiling may take minutes
 FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # operations that change a flight
 ARGS_BYTES_MAX = 4000  # maximum size of arguments that an event repeats in full; all operations need far less
 
@@ -204,7 +204,7 @@ class Coordinator(ABC):
             outbox.event("doubled", name, text, {"other": other})
 
     def _handle_bye(self, name: str, message: Bye, wall_ns: int) -> None:
-        """Remove a participant that says bye; a bye without incarnation takes effect once the token is lost."""
+        """Remove a participant that says bye; a bye without run id or incarnation waits for the loss of the token."""
         participant = self.barrier.participants.get(name)
         if participant is None:
             return
@@ -397,7 +397,7 @@ class Coordinator(ABC):
         self.outbox.event("no_show", name, text, data)
 
     def not_shown(self, name: str, fault: str, wall_ns: int) -> None:
-        """Undo the join of a participant that has not proved its existence."""
+        """Undo the join of a participant that has not proved its existence; one that had rejoined counts as dead."""
         participant = self.barrier.participants.get(name)
         if participant is None or not participant.alive or self._has_left(name, wall_ns):
             return
@@ -480,7 +480,9 @@ class Coordinator(ABC):
         return self.blocking() if waits else []
 
     def must_wait_for(self, participant: Participant) -> bool:
-        """Return whether the scenario needs a participant, so that its first step may take any length of time."""
+        """Return whether a participant's first step may take any length of time.
+
+        It may if the process is unpaced, or if the scenario needs it and it replaced no living process."""
         if participant.served_names <= self.unpaced:
             return True
         return not participant.successor and not participant.served_names.isdisjoint(self._expected)
@@ -492,7 +494,7 @@ class Coordinator(ABC):
         return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self.start_wall_ns, self._data_flow.feeds)
 
     def missed(self, wall_ns: int) -> tuple[Waiting, ...]:
-        """Return, in realtime, the participants that are dead, silent or away; the world does not wait for them."""
+        """Return, in realtime, the participants that are dead, silent or away; the world waits only for those away."""
         if self.clock.mode != "realtime":
             return ()
         missed = (p for p in self.barrier.participants.values() if p.is_missed)

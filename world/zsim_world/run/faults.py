@@ -28,8 +28,8 @@ SELECTORS = ("id", "target", "kind")
 class FaultInjector:
     """The faults of a run, which `effects` applies to the fleet.
 
-    A requested fault begins with the next gate to be integrated, on which no process can have worked yet, so that a run
-    with the same faults at the same times gives the same bits.
+    A fault that is requested without a time begins with the next gate to be integrated, on which no process can have
+    worked yet, so that a run with the same faults at the same times gives the same bits.
     """
 
     SAVED: ClassVar[Saved] = {
@@ -159,7 +159,7 @@ class FaultInjector:
         for path, text in flaws(args, known):
             return f"{path or 'args'} {text}"
         if args["kind"] == PROCESS_KILL and (immune := self._immunity(args["target"])):
-            allowed = f"must be a process that a kill ends ({PROCESS_KILL})"
+            allowed = f"must be a process that {PROCESS_KILL} can end"
             return Refusal("target", f"{show(args['target'])}, which {immune}", allowed)
         if args["kind"] == "radio" and scenario.own_messages() and scenario.radio_of_agents is None:
             return Refusal(
@@ -171,8 +171,8 @@ class FaultInjector:
         if at_s is not None and at_s >= end_s:
             return Refusal("at_s", f"{at_s:g}", f"must be < {end_s:g}, the end of the run")
         if len(self._faults) >= FAULTS_MAX:
-            allowed = f"must be at most {FAULTS_MAX}, so clear some"
-            return Refusal("the number of faults that are planned or act", str(len(self._faults)), allowed)
+            allowed = f"must be < {FAULTS_MAX} before one is added; clear some"
+            return Refusal("the number of faults that are planned or acting", str(len(self._faults)), allowed)
         return None
 
     def _plan(self, args: Mapping[str, Any], source: str) -> Fault:

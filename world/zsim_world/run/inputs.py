@@ -25,7 +25,7 @@ from zsim_world.run.coordinator import Coordinator
 
 PHASE_EVERY = 10  # one in this many cluster states is read for the phase on display
 CAMERA_MESSAGES = (flight_messages.CameraInfo, flight_messages.Sightings)  # relayed from every process with a camera
-DRIVER_TOPICS = ("truth", "link")  # published by the driver of an external drone, beside its sensors
+DRIVER_TOPICS = ("truth", "link")  # published by the driver of an external drone, besides its sensors
 
 ProgressCallback = Callable[[str, Any, str], None]
 """Shows progress. Called with ("clock" or "event", message, phase of the clusters), ("health", message, process), every
@@ -56,7 +56,7 @@ PAGE_BYTES = 8_000_000  # limit on the payloads of one answer
 EXPRESSIONS_MAX = 1000  # key expressions of one replay; a controller of hundreds of drones reads two keys of each
 _Entry = tuple[int, int, Pairs, int, bool]
 """Messages kept together: the world's time at arrival, their stamp, keys and payloads, the size of the payloads
-[bytes], and whether they are outside the contract."""
+[bytes], and whether they are refused or outside the contract."""
 
 
 class _Head(msgspec.Struct):
@@ -339,7 +339,7 @@ class MessageHistory:
             self._keep(self._now_ns, [(key, payload)], len(payload), foreign=True)
 
     def add_all(self, published: Pairs, t_ns: int) -> None:
-        """Keep messages of the world, all stamped t_ns, its newest gate."""
+        """Keep the messages of the world's newest gate, t_ns, as if all were stamped t_ns."""
         self._now_ns = t_ns
         self.last_values.update(published)
         self._keep(t_ns, published, sum([len(payload) for _, payload in published]))

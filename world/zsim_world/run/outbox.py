@@ -130,7 +130,7 @@ class RefusalLog:
         by_reason[pattern] = former + 1
         if former >= EVENTS_MAX or not self._total.spend(""):
             return None
-        last = " (further ones are counted only)" if former == EVENTS_MAX - 1 else ""
+        last = " (further ones are only counted)" if former == EVENTS_MAX - 1 else ""
         return f"{subject}: {reason}{last}"
 
 

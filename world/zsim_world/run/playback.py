@@ -34,7 +34,7 @@ from zsim_world.run.run_clock import number, refused_argument
 
 RECORD_ENDED = "the record is over"  # why a replay of the whole record ended
 
-NOT_FLYABLE = "a replay: nobody can be flown"
+NOT_FLYABLE = "a replay: no drone can be flown"
 SEEK_MAX_S = 1e9  # limit that keeps nanoseconds within an int64
 VIEWED_MAX = 10_000  # drones times time steps in one answer to `views`: 2 MB
 VIEWED_MAX_S = 60.0  # simulated time in one answer to `views`; design choice: the replay stands still while reading
@@ -71,7 +71,7 @@ class Playback(Coordinator):
 
     Args:
         reader: reader of the record; it stays open.
-        scenario, info: scenario and `world/info` on record.
+        scenario, info: scenario and `world/info` of the recorded run.
         rate: simulated seconds per wall second; 0: as fast as possible.
         run_id: set by tests that compare records.
 
@@ -123,7 +123,7 @@ class Playback(Coordinator):
             raise RecordError(f"{reader.path}: holds no gate {window}; nothing can be played")
 
     def info(self) -> messages.Info:
-        """Return the `world/info` on record, adapted to the replay."""
+        """Return the recorded `world/info`, adapted to the replay."""
         return msgspec.structs.replace(
             self._recorded,
             federation=self.scenario.federation,
@@ -185,7 +185,7 @@ class Playback(Coordinator):
         return _Live({name for names in served for name in names}, by_name)
 
     def _is_replaced(self, recorded: Recorded, live: _Live) -> bool:
-        """Return whether a participant publishes a message in place of one on record."""
+        """Return whether a participant publishes a message in place of the recorded one."""
         role = CAMERA_ROLES.get(messages.type_of(recorded.key))
         if role is None:
             return bool(live.names) and _author(recorded) in live.names
@@ -213,7 +213,9 @@ class Playback(Coordinator):
             self._publish(recorded)
 
     def _publish(self, recorded: Recorded) -> None:
-        """Publish a recorded message unchanged, except for events, which are renumbered, and kills of processes."""
+        """Publish a recorded message unchanged, except that events are renumbered and kills of processes left out.
+
+        The event `end` and `view/drones` are not published: the replay has its own."""
         key, payload = recorded.key, recorded.payload
         if key == keys.EVENT:
             with suppress(DecodeError):
@@ -304,15 +306,15 @@ class Playback(Coordinator):
         """Continue from another gate. Refused while a participant gates: it would miss the gates in between."""
         t_s = number(request.args.get("t_s"))
         if t_s is None or not 0 <= t_s < SEEK_MAX_S:
-            return refused_argument(request, "t_s", "a time on record [s]")
+            return refused_argument(request, "t_s", "a time within the record [s]")
         gating = [p.name for p in self.barrier.participants.values() if p.gating]
         if gating:
-            return Refusal(", ".join(gating), "in the lockstep", "seek needs nobody who is waited for")
+            return Refusal(", ".join(gating), "in the lockstep", "seek is possible only while no process is waited for")
         former = self._gates, self._coming, self._pending
         self._continue_from(round(t_s * 1e9))
         if self._coming is None:
             self._gates, self._coming, self._pending = former
-            return refused_argument(request, "t_s", "a time on record [s]")
+            return refused_argument(request, "t_s", "a time within the record [s]")
         self._last.clear()
         self.statistics.rate.jump()
         if keys.FAULTS in self._latched and not any(m.key == keys.FAULTS for m in self._pending):
@@ -336,10 +338,10 @@ class Playback(Coordinator):
         return ControlAnswer(True, result={**span, "marks": marks[:: -(-len(marks) // MARKS_MAX) or 1]})
 
     def _past_views(self, request: ControlRequest) -> Refusal | ControlAnswer:
-        """Answer with the views at instants on record, `every_s` apart, for curves and trails."""
+        """Answer with the views at recorded instants, `every_s` apart, for curves and trails."""
         from_s, to_s, every_s = (number(request.args.get(name)) for name in ("from_s", "to_s", "every_s"))
         if from_s is None or not 0.0 <= from_s < SEEK_MAX_S:
-            return refused_argument(request, "from_s", "a time on record [s]")
+            return refused_argument(request, "from_s", "a time within the record [s]")
         if to_s is None or not from_s <= to_s <= from_s + VIEWED_MAX_S:
             return refused_argument(request, "to_s", f"from from_s to {VIEWED_MAX_S:g} s after it")
         count_max = max(1, VIEWED_MAX // len(self.names))

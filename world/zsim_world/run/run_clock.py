@@ -18,7 +18,7 @@ from zsim_world.run.outbox import Refusal
 
 Operation = Callable[[ControlRequest], Refusal | ControlAnswer | None]
 """Carries out a request; returns why it is refused, an answer with a result, or None when done."""
-GATES_KEPT = 256  # gates whose publication times are kept for command ages; 5 s: older commands are refused
+GATES_KEPT = 256  # gates whose publication times are kept for command ages: 5 s, ten times the default maximum age
 AGES_KEPT = 1_000_000  # ages kept for the percentiles; 8 MB
 MARK_NS = 10_000_000  # wall time between marks from which the rate over the last second is computed
 

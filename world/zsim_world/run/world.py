@@ -164,8 +164,8 @@ class World(Coordinator):
     def advance(self, wall_ns: int) -> None:
         """Advance to the next gate, or publish gate 0, and put all its messages into the outbox.
 
-        Commands and faults are applied before the fleet is integrated. A state that is no longer finite, or a user's
-        sensor that fails, ends the run at the previous gate and sets `failure`.
+        Commands and faults are applied before the fleet is integrated. A state that has diverged, or a user's sensor
+        that fails, ends the run at the previous gate and sets `failure`.
         """
         clock, fleet, statistics, now_ns = self.clock, self.fleet, self.statistics, self.clock.now_ns
         is_first = clock.state == "waiting"

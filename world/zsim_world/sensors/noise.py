@@ -1,6 +1,6 @@
 """The random numbers of a fleet: one stream per drone and sensor, one wind stream per drone, one wind stream for all.
 
-The kernel takes rows of standard normal numbers from one table; `refill` moves the unused rows to the front and draws
+The kernel takes rows of standard normal variates from one table; `refill` moves the unused rows to the front and draws
 the rest. A stream does not depend on the size of the table, nor on the other drones.
 
 The numbers are those of numpy's default generator (PCG64, ziggurat), compiled here, with the same bits (a test
@@ -30,7 +30,7 @@ STREAMS = tuple(zip(SENSORS, CHANNELS, strict=True))  # name and channels of eac
 
 
 class NoiseTable:
-    """Standard normal numbers for `gates` gates: `table`, `at`, `width` and `cursor` as in NoiseRows.
+    """Standard normal variates for `gates` gates: `table`, `at`, `width` and `cursor` as in NoiseRows.
 
     `streams` has the words of the generators, uint64 (N + 1, S, WORDS.size).
     """
@@ -190,7 +190,7 @@ def set_generator(rng: np.random.Generator, stream: Sequence[int]) -> None:
 
 @inlined
 def fill(out: NDArray, stream: NDArray) -> None:
-    """Draw standard normal numbers into out (n,), and advance the stream's words (WORDS.size,)."""
+    """Draw standard normal variates into out (n,), and advance the stream's words (WORDS.size,)."""
     state = (stream[WORDS.state], stream[WORDS.state + 1])
     step = (stream[WORDS.step], stream[WORDS.step + 1])
     drawn = 0

@@ -1,8 +1,8 @@
 """Distances measured by range beams, lidars and depth cameras: rays cast from true poses, with errors. Compiled.
 
-All rays of a message are cast at one instant, possibly between two gates. They hit the ground, obstacles and the hulls
-of other drones (zsim_world.physics.rays). Each sensor has its own random stream, from which every message draws the
-same number of values: two for each distance and one for the message.
+All rays of a message are cast at one instant, possibly between two gates. They hit the ground, obstacles, surfaces and
+the hulls of other drones (zsim_world.physics.rays). Each sensor has its own random stream, from which every message
+draws the same number of values: two for each distance and one for the message.
 """
 
 import math
@@ -52,7 +52,7 @@ SCANNER = columns(
         Field("square", "1/m"),
         Field("bias", "m"),  # constant during a run
         Field("quantum", "m"),
-        Field("miss", "1"),  # a value is missed when its standard normal number is below this
+        Field("miss", "1"),  # a value is missed when its standard normal variate is below this
         Field("drop", "1"),  # likewise, a message is lost
         Field("stuck", "1"),  # 1: stuck by a fault, repeats the first message since then
     ),

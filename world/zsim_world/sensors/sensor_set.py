@@ -6,10 +6,10 @@ A sensor is at p_BS in the body, rotated by R_BS (q_BS: sensor components to bod
 a function of body, mount and site that returns two vectors of error-free values, with unused elements zero. The first
 `n` values of a reading have errors of their own.
 
-Sonar and optical flow may see an obstacle or another drone below. A flow camera measures the motion of its picture,
-which the board scales by the sonar's distance to obtain a velocity. If a picture shows two motions, of the ground and
-of a drone below, that of the larger part prevails, as does the largest peak of a histogram of block motions (PX4/Flow,
-src/modules/flow/flow.c).
+Sonar and optical flow may see an obstacle, a surface or another drone below. A flow camera measures the motion of its
+picture, which the board scales by the sonar's distance to obtain a velocity. If a picture shows two motions, of the
+ground and of a drone below, that of the larger part prevails, as does the largest peak of a histogram of block motions
+(PX4/Flow, src/modules/flow/flow.c).
 """
 
 import math
@@ -62,7 +62,7 @@ CONFIG = columns(  # settings of one sensor of one drone
         Field("kick", "channel's", CHANNELS_MAX),  # standard deviation of that error's increment per sample
         Field("p_BS", "m", 3),
         Field("q_BS", "1", 4),
-        Field("drop", "1"),  # a sample is lost when its standard normal number is below this
+        Field("drop", "1"),  # a sample is lost when its standard normal variate is below this
         Field("limit_min", "m"),  # range limits of the sonar
         Field("limit_max", "m"),
         Field("faulty", "1"),  # 0: the row of FAULT has no effect
@@ -155,7 +155,7 @@ def config(sensors: FleetSensors) -> NDArray[np.float64]:
 
 
 def noise_width(numbers: int, models: Sequence[ErrorModel]) -> int:
-    """Return how many normal numbers a sample takes: white noise, bias walk, one for drop-out, Gauss-Markov if any."""
+    """Return how many normal variates a sample takes: white noise, bias walk, one for drop-out, Gauss-Markov if any."""
     correlated = any(model.correlated_sigma for model in models)
     return (3 if correlated else 2) * numbers + 1
 
@@ -391,7 +391,7 @@ def rounded(value: float, bias: float, white: float, quantum: float) -> float:
 def add_errors(n: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray, at: int) -> None:
     """Add the errors of the first `n` channels to error-free values, in place.
 
-    `noise` holds standard normal numbers from index `at` on, as counted by `noise_width`; `bias` holds the biases of
+    `noise` holds standard normal variates from index `at` on, as counted by `noise_width`; `bias` holds the biases of
     all channels, then the states of their Gauss-Markov processes, and is advanced in place.
     """
     if config[CONFIG.correlated] != 0.0:

@@ -1,8 +1,8 @@
 """Sightings of hats without rendering: what a camera has in view, from true poses, with a detector's errors.
 
-A hat is a ball. It is in view if it is entirely within the picture and enough of its edge is visible for a detector to
-fit a circle. It can be hidden by obstacles, surfaces, hulls (flat bodies of revolution about their drones' z axes) and,
-from below, by the rotors of the drone that wears it.
+A hat, the marker by which drones detect each other, is modelled as a ball. It is in view if it is entirely within the
+picture and enough of its edge is visible for a detector to fit a circle. It can be hidden by obstacles, surfaces, hulls
+(flat bodies of revolution about their drones' z axes) and, from below, by the rotors of the drone that wears it.
 
 Each camera has its own random stream; all pictures due in a gate are computed in one compiled call. The errors match
 those of the detector on rendered pictures (tests compare them): noise of a hat's centre and apparent diameter in
@@ -99,8 +99,8 @@ SEEN = columns(  # a sighting
         Field("sigma_range", "m"),
     ),
 )
-DRAWS = 4  # normal numbers per hat and picture: two for the centre, one for the diameter, one for a miss
-FALSE_DRAWS = 4  # normal numbers per false alarm: one for its occurrence, two for its position, one for its size
+DRAWS = 4  # normal variates per hat and picture: two for the centre, one for the diameter, one for a miss
+FALSE_DRAWS = 4  # normal variates per false alarm: one for its occurrence, two for its position, one for its size
 # Error of a measured diameter over that of a centre, due to noise and due to blur; measured
 DIAMETER_NOISE, DIAMETER_BLUR = 1.4, 2.8
 ANGLE_MAX = 3.0  # rad, largest apparent diameter; pi is that of a ball touching the lens
@@ -318,7 +318,7 @@ def _rim_hides(eye: Vector, ray: Vector, p_WB: Vector, q_WB: Quaternion, radius:
 
 @inlined
 def _drone_hides(eye: Vector, ray: Vector, away: float, i: int, m: int, pose: NDArray, radius: float) -> bool:
-    """Return whether drone `i` blocks a ray to a ball, which is the hat of drone `m` or, if `m` is no drone, no hat."""
+    """Return whether drone `i` blocks a ray to a ball: the hat of drone `m`, or a decoy if no drone has index `m`."""
     p, q = vector(pose, STATE.p_WB), four(pose, STATE.q_WB)
     return _rim_hides(eye, ray, p, q, radius) if i == m else _hull_hides(eye, ray, away, p, q, radius)
 
@@ -463,7 +463,7 @@ def hats_in_view(
 
 @inlined
 def _unit(normal: float) -> float:
-    """Convert a standard normal number to a uniform one in [0, 1]."""
+    """Convert a standard normal variate to a uniform one in [0, 1]."""
     return normal_probability(-normal)
 
 

@@ -71,7 +71,7 @@ class LivelinessMonitor:
         self._health.received(name, time.monotonic_ns())
 
     def check_all(self) -> None:
-        """In a restarted world, schedule a check of each former participant for the time by which it rejoins."""
+        """In a restarted world, schedule a check of each former participant for when it must have rejoined."""
         for name, participant in self._barrier.participants.items():
             wait_ns = RETURN_NS if participant.alive else START_NS
             if participant.away or participant.alive:
@@ -155,7 +155,7 @@ class HealthWatch:
     def look(self, wall_ns: int) -> dict[str, int]:
         """Report processes that have fallen silent; return the time since each process's last health message [ns].
 
-        Must be called more often than every STALL_NS.
+        Must be called at least once every STALL_NS.
         """
         stall_ns = wall_ns - self._look_wall_ns
         self._look_wall_ns = wall_ns

@@ -174,10 +174,11 @@ class RunJournal:
     def open(self) -> Checkpoint | None:
         """Create or open the journal; return the checkpoint to continue from, or None for a new run.
 
-        The checkpoint is the second newest, so that the inputs since then (`entries`) refill the message history.
+        The checkpoint is the second newest, if there are two, so that the inputs since then (`entries`) refill the
+        message history.
 
         Raises:
-            RunError: the journal belongs to another run, is in use, or cannot be read or written.
+            RunError: the journal belongs to another run, is in use, is incomplete, or cannot be read or written.
         """
         checkpoint = None
         if not self._is_kept:

@@ -467,7 +467,7 @@ def open_inputs(link: Session, realtime: bool) -> DirectInputs | TimedInputs:
 
 
 def recover_lost(link: Session, run: Run) -> None:
-    """Request the outputs that participants have counted but that have not arrived, e.g. after a link was cut."""
+    """In lockstep, request outputs that participants have counted but that have not arrived, e.g. after a cut link."""
     world = run.world
     for participant in world.barrier.incomplete():
         if participant.away:
@@ -584,7 +584,7 @@ class Pacer:
     def due_ns(self, wall_ns: int) -> int:
         """Return the wall time at which the next gate is due [ns].
 
-        The pace restarts after a change of rate, a time jump or, in lockstep, a standstill.
+        The pace restarts after a change of rate, a pause, a time jump or, in lockstep, a standstill.
         """
         clock = self._clock
         if clock.rate <= 0 or clock.state != "running":

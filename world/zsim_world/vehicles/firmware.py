@@ -395,7 +395,7 @@ def is_standing(memory: NDArray, setting: NDArray) -> bool:
 
 @inlined
 def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
-    """Change the mode and clear the holds."""
+    """Change the mode and clear the holds; a drone that enters LANDED notes whether it is on an obstacle."""
     memory[MEMORY.mode], memory[MEMORY.steps], memory[MEMORY.touch] = mode, 0.0, 0.0
     memory[MEMORY.holds_xy], memory[MEMORY.holds_z] = 0.0, 0.0
     if mode == LANDED:

@@ -64,7 +64,7 @@ BELIEF = columns(  # followed by R modelled rotor speeds [rad/s]
         Field("sonar_age", "1"),  # steps since the last good echo
         Field("lift_bias", "m/s^2"),  # vertical bias of the accelerometer
         Field("heading", "rad"),  # heading of q_WB
-        Field("stand_height", "m"),  # height of the obstacle on which the drone has landed; 0 on the ground
+        Field("stand_height", "m"),  # height of a drone that has landed on an obstacle; 0 on the ground
     ),
 )
 DEVICE = columns(  # newest sample of each sensor, and flags of new samples

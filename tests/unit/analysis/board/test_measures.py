@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from zsim.record.completeness import Completeness
 from zsim_agents.laws.pilot import polygon
-from zsim_analysis.board.measures import DesiredTrack, FormationTrack, lattice_errors, shape_errors
+from zsim_analysis.board.measures import DesiredTrack, FormationTrack, formation_track, lattice_errors, shape_errors
+from zsim_analysis.reading.recorded_flight import RecordedFlight, Track
 
 C = polygon(5, 3.0)
 T = np.arange(4.0)
@@ -52,6 +54,18 @@ def test_drones_on_the_ground_do_not_count() -> None:
     assert error(lost, "translation") == pytest.approx(0.0, abs=1e-9)
     lost[1:] = np.nan
     assert math.isnan(error(lost, "translation"))
+
+
+def test_drones_without_status_do_not_count() -> None:
+    t_ns = np.arange(3) * 1_000_000_000
+    tracks = [
+        Track(f"drone{i}", t_ns, np.full((3, 13), float(i)), t_ns[: len(states)], states, np.zeros(len(states)))
+        for i, states in enumerate((["flying"] * 3, []))
+    ]
+    flight = RecordedFlight(None, None, tracks, [], [], [], 0, Completeness(), 0.0)
+    p = formation_track(flight, entire_flight=True).p
+    assert np.isfinite(p[:, 0]).all()
+    assert np.isnan(p[:, 1]).all()
 
 
 def test_the_lattice_error_counts_only_sides_within_range() -> None:

@@ -78,8 +78,8 @@ def test_an_option_of_unexpected_size_is_kept_unparsed():
         (BOOTSTRAP[:-1], "has 23 bytes"),
         (b"\0" + BOOTSTRAP[1:], "begins with 0x55667700"),
         (BOOTSTRAP[:-1] + b"\1", "the checksum is"),
-        (BOOTSTRAP[:16] + b"\0\0\0\0" + BOOTSTRAP[16:], "has the size 0"),
-        (BOOTSTRAP[:16] + b"\0\0\xff\0" + BOOTSTRAP[16:], "beyond the packet's 28 bytes"),
+        (BOOTSTRAP[:16] + b"\0\0\0\0" + BOOTSTRAP[16:], "option 0 at byte 16 has 0 bytes; must have at least 4$"),
+        (BOOTSTRAP[:16] + b"\0\0\xff\0" + BOOTSTRAP[16:], "option 0 at byte 16 has 255 bytes; must have at most 12$"),
         (BOOTSTRAP[:16] + struct.pack("<HHI", 26, 8, 0), "has no checksum"),
     ],
 )

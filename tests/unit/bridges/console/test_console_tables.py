@@ -32,7 +32,17 @@ def test_a_paused_run_adds_nothing_to_the_rates():
     rates.update("d1", 0, {"gps": (0, 0)})
     for _ in range(1000):
         assert rates.update("d1", S // 2, {"gps": (5, 0)})["gps"] == pytest.approx(10.0)
-    assert len(rates._samples) == 2
+    assert len(rates._samples["d1"]) == 2
+
+
+def test_rates_of_several_drones_are_followed_until_they_are_no_longer_shown():
+    rates = SensorRates()
+    for t_ns in (0, S):
+        found = [rates.update(drone, t_ns, {"gps": (5 * t_ns // S, 0)}) for drone in ("d1", "d2")]
+    assert found == [{"gps": pytest.approx(5.0)}] * 2
+    rates.keep(("d2",))
+    assert rates.update("d1", 2 * S, {"gps": (10, 0)}) == {}
+    assert rates.update("d2", 2 * S, {"gps": (10, 0)}) == {"gps": pytest.approx(5.0)}
 
 
 def test_a_user_defined_sensor_has_a_row_with_or_without_counts():

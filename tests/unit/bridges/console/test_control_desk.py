@@ -76,7 +76,7 @@ def test_a_page_closed_while_it_is_drawn_does_not_affect_the_others():
     pages.open(1)
     pages.open(2)
     pages.figures[1].removed = True
-    forms.show([], {}, lambda drone: f"figures of {drone}", [])
+    forms.show([], {}, lambda drones: {drone: f"figures of {drone}" for drone in drones}, [])
     assert (pages.figures[1].shown, pages.figures[2].shown) == ("", "figures of drone1")
     assert forms.chosen(1) == ""
     assert forms.chosen(2) == "drone1"
@@ -133,6 +133,17 @@ def test_one_page_is_in_control_and_the_others_see_it(desk: Desk):
     assert desk.refusal(7, "")
     desk.release(7, RUN)
     assert desk.refusal(4, "") == ""
+
+
+def test_a_refusal_of_a_drone_names_it_and_the_part_to_ask_for():
+    pages, desk = Pages(), ControlDesk(["main"])
+    server: Any = pages
+    forms = PageForms(server, MagicMock(), MagicMock(parts={}), NAMES, MagicMock(), desk, lambda _: RUN)
+    pages.open(1)
+    pages.open(2)
+    assert forms.use(1, "drone2") == ""
+    assert has_terms(forms.use(2, "drone2"), "operator 1", "time and faults", "drone2", "Control")
+    assert has_terms(desk.refusal(2, RUN), "operator 1", "time and faults", "Control")
 
 
 def test_control_is_requested_and_granted_or_kept(desk: Desk):

@@ -21,6 +21,7 @@ from zsim_agents.references.path import SHARE, PathLimits
 from zsim_bridges.console.manual_flight import (
     PAGE_TIMEOUT_S,
     PERIOD_S,
+    RATE_MAX,
     SETTLED_S,
     STALE_S,
     DronePose,
@@ -272,6 +273,15 @@ def test_the_end_of_a_flight_releases_the_drone_and_gives_the_reason(end: str, f
     answer = flown.control.answer(PAGE)
     assert answer.state == "none"
     assert answer.text
+
+
+def test_a_flight_ends_above_twice_the_limit_of_the_rate_and_states_the_true_rate(flown: Cockpit):
+    flown.run = RunStatus(rate=2.0 * RATE_MAX)
+    flown.after(PERIOD_S)
+    assert flown.control.answer(PAGE).state == "flying"
+    flown.run = RunStatus(rate=12.0)
+    flown.after(PERIOD_S)
+    assert has_terms(flown.control.answer(PAGE).text, "12.0 ×", f"{RATE_MAX:g} or less")
 
 
 def test_a_command_that_arrives_after_the_release_causes_another_release(flown: Cockpit):

@@ -20,6 +20,7 @@ from zsim_bridges.console.run_condition import (
     fleet_refusals,
     formation_refusals,
     preflight_checks,
+    run_refusals,
 )
 
 DEAD, LOW = Alarm("red", "estimator.drone1", "dead"), Alarm("amber", "drone1", "battery", "17 %")
@@ -227,6 +228,12 @@ def test_the_check_of_a_fit_drone_lists_all_its_items():
     lines = preflight_lines({"drone1": checks})
     assert has_terms(without_tags(lines), "✓", "73 %", "σ 0.20 m", "armed", "free")
     assert "<b>" not in preflight_lines({"drone1": (Check("control", "<b>x</b>", False),)}).partition("</b>")[2]
+
+
+def test_before_the_first_clock_the_controls_of_time_wait_for_it():
+    refusals = run_refusals(RunCondition())
+    for op in ("pause", "resume", "step"):
+        assert has_terms(refusals[op], "waiting", "clock")
 
 
 @pytest.mark.parametrize(

@@ -241,14 +241,14 @@ def test_a_replay_is_labelled_as_such():
 def test_a_dead_estimator_is_not_shown_as_healthy(monitored: MonitoredRun):
     for second in range(3):
         monitored.deliver(drones(second * S), estimate(second * S, used=5 * second), health())
-        monitored.words.sensor_table("drone1")
+        monitored.words.sensor_tables(["drone1"])
         monitored.wall_s += 1.0
-    assert "5 Hz" in monitored.words.sensor_table("drone1")
+    assert "5 Hz" in monitored.words.sensor_tables(["drone1"])["drone1"]
     assert monitored.words.drone_rows()[0].drone.lag_ms == 0.0
     monitored.wall_s += 8.0
     monitored.deliver(drones(10 * S))
     assert monitored.words.drone_rows()[0].drone.lag_ms == 8000.0
-    shown = monitored.words.sensor_table("drone1")
+    shown = monitored.words.sensor_tables(["drone1"])["drone1"]
     assert has_terms(without_tags(shown), "no estimate", "2.0 s")
     assert "Hz" not in shown
     assert not monitored.views.estimates()["drone1"].is_fresh
@@ -282,7 +282,7 @@ def test_the_later_of_two_estimates_of_a_drone_is_shown(order: tuple[int, int], 
     assert monitored.views.estimates()["drone1"].process == "estimator.new"
     assert monitored.words.drone_rows()[0].gps == "2 / 0"
     assert monitored.words.drone_rows()[0].drone.lag_ms == 3.0
-    assert "<td align=left>2</td>" in monitored.words.sensor_table("drone1")
+    assert "<td align=left>2</td>" in monitored.words.sensor_tables(["drone1"])["drone1"]
 
 
 def test_an_invalid_covariance_has_no_sigma():

@@ -21,7 +21,7 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Status, Velocity
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin
-from zsim.errors import DecodeError, NoWorldError
+from zsim.errors import DecodeError, NoWorldError, SessionError
 from zsim.runtime.rate_limit import RateLimit
 from zsim.transport.session import RawSample
 from zsim_bridges.gateway import client_streams, run_access
@@ -43,7 +43,7 @@ from zsim_bridges.gateway.client_messages import (
 from zsim_bridges.gateway.client_streams import BOUNDARY, Outbox, PictureFeed, PictureFeeds, picture_part
 from zsim_bridges.gateway.gateway_server import Client
 from zsim_bridges.gateway.http_server import AccessCheck, description, methods_of, sample_to_json, value_event
-from zsim_bridges.gateway.run_access import EchoFilter, LastValues, LockstepSession, gate_keys_of
+from zsim_bridges.gateway.run_access import EchoFilter, LastValues, LockstepSession, SharedSubscriptions, gate_keys_of
 
 VELOCITY = "drone/drone1/cmd/velocity"
 GATE_NS = 20_000_000
@@ -268,6 +268,24 @@ def test_a_client_limit_admits_only_its_number_of_clients():
         limit.enter()
     limit.leave()
     limit.enter()
+
+
+def test_a_refused_subscription_leaves_nothing_to_share():
+    """A later client would share a subscription on which nothing arrives."""
+    loop: Any = None
+    link: Any = Unreadable()
+    subscriptions = SharedSubscriptions(loop, ClientLimit(1))
+    subscriptions.attach(link)
+    for _ in range(2):
+        with refused(SessionError, VELOCITY):
+            subscriptions.subscribe(VELOCITY, lambda sample: None)
+
+
+class Unreadable:
+    """A session whose certificate does not permit reading."""
+
+    def declare_subscriber(self, expression: str, callback: Callable[[RawSample], None]) -> Callable[[], None]:
+        raise SessionError(f"{expression}: may not be read")
 
 
 class FakeGateway:

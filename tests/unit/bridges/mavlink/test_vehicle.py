@@ -8,8 +8,9 @@ from typing import Any
 
 import msgspec
 import pytest
-from mavlink_drone import FlownDrone
+from mavlink_drone import SCENARIO, FlownDrone
 
+from zsim.contract import messages
 from zsim.contract.flight_messages import Mode as ModeCommand
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import Event
@@ -565,6 +566,25 @@ def test_messages_are_sent_at_the_requested_rates() -> None:
     assert drone.all(dialect.LocalPositionNed) == []
     assert drone.command(Cmd.GET_MESSAGE_INTERVAL, 30) == Result.ACCEPTED
     assert drone.all(dialect.MessageInterval)[-1].interval_us == 20_000
+
+
+def test_telemetry_of_rotated_sensors_is_in_the_axes_of_the_body() -> None:
+    mounts = "imu: {mount: {rpy_deg: [0, 0, 90]}}, mag: {mount: {rpy_deg: [180, 0, 0]}}"
+    drone = FlownDrone(scenario=SCENARIO.replace("preset: paper", f"preset: paper, {mounts}"))
+    t = (drone.t_ns, 0, drone.t_ns)
+    drone.vehicle.state.update("imu", messages.Imu(*t, (1.0, 2.0, 9.0), (0.1, 0.2, 0.3)))
+    drone.vehicle.state.update("mag", messages.Mag(*t, (10.0, 20.0, -40.0)))
+
+    def built(kind: Any) -> Any:
+        return drone.vehicle._telemetry.build(dialect.LAYOUTS[kind].id)
+
+    imu, raw, attitude = map(built, (dialect.HighresImu, dialect.RawImu, dialect.Attitude))
+    assert (imu.xacc, imu.yacc, imu.zacc) == pytest.approx((-2.0, -1.0, -9.0))  # forward, right, down
+    assert (imu.xgyro, imu.ygyro, imu.zgyro) == pytest.approx((-0.2, -0.1, -0.3))
+    assert (imu.xmag, imu.ymag, imu.zmag) == pytest.approx((0.1, 0.2, -0.4))
+    assert (raw.xgyro, raw.ygyro, raw.zgyro) == (-200, -100, -300)
+    assert (raw.xmag, raw.ymag, raw.zmag) == (100, 200, -400)
+    assert (attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed) == pytest.approx((-0.2, -0.1, -0.3))
 
 
 def test_messages_for_other_systems_are_ignored_timesync_and_ping_answered() -> None:

@@ -362,6 +362,29 @@ async def test_another_type_on_the_same_topic_is_refused_and_reported(graph) -> 
 
 
 @in_loop
+async def test_a_refused_publisher_is_followed_once_it_registers_the_right_type(graph) -> None:
+    """A publisher that restarts at the same URI is announced in the same list as before."""
+    kinds = iter([EMPTY, TWIST])
+    node = graph.node("/b")
+    node.subscribe("/t", TWIST, lambda _: None)
+
+    async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await wire.read_header(reader)
+        writer.write(wire.encode_header(wire.publisher_header(wire.topic_type_of("/t", next(kinds)), "/a")))
+        await reader.read()
+        writer.close()
+
+    server = await asyncio.start_server(publish, "127.0.0.1", 0)
+    with Slave(server.sockets[0].getsockname()[1]) as uri:
+        graph.master.graph.publishers["/t"].append(uri)
+        async with node.running():
+            await until(lambda: graph.has_line("datatype/md5sum"))
+            await call(graph.master.graph.nodes["/b"], "publisherUpdate", "/t", [uri])
+            await until(lambda: node.subscribed["/t"].connected == {uri: "/a"})
+    server.close()
+
+
+@in_loop
 async def test_a_node_waits_for_its_master_and_registers_again_after_a_restart(graph) -> None:
     node = graph.node("/a")
     node.publish("/t", TWIST, 10)

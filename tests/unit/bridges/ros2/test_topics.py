@@ -17,6 +17,7 @@ from zsim.sensors.sensor import ErrorModel, Mount
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim_bridges.ros2 import rmw_zenoh, topics
 from zsim_bridges.ros2.topics import DroneCameras, NavdataSummary
+from zsim_bridges.vehicle_links.drone_link import BodyAxes
 
 SENSORS = scenario_file.from_text(ONE).drones[0].sensors
 T_NS = 3_020_000_000
@@ -205,7 +206,7 @@ def test_the_battery_is_published_every_second_and_the_state_on_change_too() -> 
 
 def test_navdata_has_the_units_and_signs_of_the_driver() -> None:
     """Right side down, nose down and counter-clockwise are positive; the units are g, mm, mm/s, deg, Pa and us."""
-    navdata = NavdataSummary("base")
+    navdata = NavdataSummary("base", BodyAxes())
     converted: dict[str, Any] = {
         "imu": messages.Imu(T_NS, 0, T_NS, (0.0, -4.903325, 9.80665), (0.0, 0.0, 0.0)),
         "baro": messages.Baro(T_NS, 0, T_NS, 101_325.4, 0.0),
@@ -224,8 +225,18 @@ def test_navdata_has_the_units_and_signs_of_the_driver() -> None:
     assert rmw_zenoh.encode(made, "zsim_msgs/msg/Navdata")
 
 
+def test_navdata_of_rotated_sensors_is_in_the_axes_of_the_body() -> None:
+    axes = BodyAxes(imu=Mount(rpy_deg=(0.0, 0.0, 90.0)), mag=Mount(rpy_deg=(180.0, 0.0, 0.0)))
+    navdata = NavdataSummary("base", axes)
+    navdata.update("drone/drone1/sensor/imu", messages.Imu(T_NS, 0, T_NS, (4.903325, 0.0, 9.80665), (0.0, 0.0, 0.0)))
+    navdata.update("drone/drone1/sensor/mag", messages.Mag(T_NS, 0, T_NS, (1.0, 2.0, 3.0)))
+    made: Any = navdata.update("drone/drone1/sensor/status", status(T_NS))
+    assert (made.ax, made.ay, made.az) == pytest.approx((0.0, 0.5, 1.0))
+    assert (made.mag_x, made.mag_y, made.mag_z) == pytest.approx((1.0, -2.0, -3.0))
+
+
 def test_navdata_without_samples_is_zero_or_nan() -> None:
-    navdata = NavdataSummary("base")
+    navdata = NavdataSummary("base", BodyAxes())
     made: Any = navdata.update("drone/drone1/sensor/status", status(0, "emergency"))
     assert (made.state, made.pressure, made.altd) == (0, 0, 0)
     assert math.isnan(made.rot_x)

@@ -80,3 +80,15 @@ class LatePublisher:
 def test_a_subscription_during_the_check_for_subscribers_is_noticed() -> None:
     raw: Any = SimpleNamespace(declare_publisher=lambda key, **settings: LatePublisher())
     assert Session(raw, "zsim", Identity("here")).has_subscribers("drone/*/truth")
+
+
+def test_an_expression_that_zenoh_refuses_is_not_listed_as_read() -> None:
+    def refuse(expression: str, *_: Any, **__: Any) -> None:
+        raise zenoh.ZError(f"Invalid Key Expr `{expression}`")
+
+    raw: Any = SimpleNamespace(declare_subscriber=refuse)
+    session = Session(raw, "zsim", Identity("here"))
+    for subscribe in (session.subscribe, lambda key: session.declare_subscriber(key, lambda sample: None)):
+        with pytest.raises(SessionError, match="drone//truth"):
+            subscribe("drone//truth")
+    assert session.reads == []
