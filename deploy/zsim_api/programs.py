@@ -9,8 +9,8 @@ keeper is this file, run by path:
 Standard input of the keeper is a pipe from its caller, which closes when the caller ends: the program then receives
 SIGTERM, and is killed if it has not ended within the grace period. The keeper forwards SIGINT, SIGTERM and SIGHUP to
 the program's process group; SIGUSR1 kills the program and its descendants. Descendants that outlive the program are
-killed after the same grace period. (Killing works on Linux only.) The exit code is the program's, 128 + N for a signal,
-as in shells, or 127 if the program cannot be started.
+killed after the same grace period. (Outside Linux, only its process group is killed.) The exit code is the program's,
+128 + N for a signal, as in shells, or 127 if the program cannot be started.
 
 Only the standard library is imported here, so that a keeper starts within milliseconds.
 """
@@ -143,16 +143,22 @@ def keep(grace_s: float, command: list[str]) -> int:
             with suppress(ProcessLookupError):
                 os.killpg(program.pid, number)
 
+    def kill() -> None:
+        if sys.platform == "linux":
+            _kill_children()
+        else:
+            forward(signal.SIGKILL)
+
     def await_caller() -> None:
         while os.read(sys.stdin.fileno(), 1):
             continue
         forward(signal.SIGTERM)
         time.sleep(grace_s)
-        _kill_children()
+        kill()
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, forward)
-    signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=_kill_children, daemon=True).start())
+    signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=kill, daemon=True).start())
     if sys.platform == "linux":  # detached descendants become children of this process
         ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     try:
@@ -165,7 +171,7 @@ def keep(grace_s: float, command: list[str]) -> int:
     threading.Thread(target=await_caller, daemon=True).start()
     code = program.wait()
     forward(signal.SIGTERM)
-    killer = threading.Timer(grace_s, _kill_children)
+    killer = threading.Timer(grace_s, kill)
     killer.daemon = True
     killer.start()
     with suppress(ChildProcessError):  # no child is left
@@ -175,7 +181,7 @@ def keep(grace_s: float, command: list[str]) -> int:
 
 
 def _kill_children() -> None:
-    """Kill all children (known only on Linux), then their children, which in turn become children of this process."""
+    """Kill all children, known on Linux only, then their children, which in turn become children of this process."""
     while children := [pid for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]:
         for pid in children:
             with suppress(ProcessLookupError):

@@ -444,6 +444,6 @@ def _bytes(value: Any) -> int:
 def _check_size(variable: str, size: int) -> None:
     if size > VARIABLE_MAX:
         raise ReportError(
-            f"{variable}: would be {size / 2**30:.1f} GB; must be < 2 GB for MATLAB to load it from a Level 5 "
+            f"{variable}: would be {size / 2**30:.1f} GiB; must be < 2 GiB for MATLAB to load it from a Level 5 "
             "MAT-file; select less by --keys, --from and --to, or use --format parquet (parquetread in MATLAB)"
         )

@@ -159,8 +159,9 @@ class DriverLink(Struct, frozen=True):
             ("round trip {:.0f} ms", self.round_trip_ms),
         )
         parts = [text.format(value) for text, value in values if value is not None]
-        lost = f"lost {self.lost} times, for {self.lost_s:.1f} s" if self.lost else "never lost"
-        refused = [f"{self.refused} messages refused"] if self.refused else []
+        times = "once" if self.lost == 1 else f"{self.lost} times"
+        lost = f"lost {times}, for {self.lost_s:.1f} s" if self.lost else "never lost"
+        refused = [f"{self.refused} message{'' if self.refused == 1 else 's'} refused"] if self.refused else []
         return ", ".join([self.peer, *parts, lost, *refused])
 
 

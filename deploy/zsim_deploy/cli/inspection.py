@@ -22,7 +22,7 @@ LINE_S = 1.0  # interval between lines of `hz`, wall time
 SILENCE_S = 1.0  # wall time without a message after which `hz` reports silence; twice the longest gap if that is longer
 UNHEARD_S = 3.0  # wall time after which a key without any message is reported; live keys have at least one a second
 NAMED_MAX = 5  # maximum number of similar keys suggested for a key without a publisher
-OUTCOME_S = 3.0  # wall time for the world to report the outcome of a command; a paused world does not report it
+OUTCOME_S = 3.0  # wall time for the world to report the outcome of a command; a slow or paused world takes longer
 UNKNOWN_SENDER = "somebody"  # source in the world's event about a message that it could not decode
 PUB, ASK = "zsim.pub", "zsim.ask"
 COMMANDS = "drone/*/cmd/*"
@@ -239,7 +239,9 @@ def _outcome(
         if time.monotonic() >= until_s:
             latest = clock.clock()
             state = latest.state if latest else "unknown"
-            note = f"the world is {state}; the outcome will be known only when time continues"
+            note = f"the outcome is not known after {OUTCOME_S:g} s; the state of the world is {state}"
+            if state in ("waiting", "paused"):
+                note = f"the world is {state}; the outcome will be known only when time continues"
             return Published(sent, min(refused, sent), reason, note)
         time.sleep(POLL_S)
 

@@ -477,8 +477,10 @@ def rerun(
     from zsim_analysis.bundle.bundle_file import is_bundle
 
     from_bundle = is_bundle(place)
-    if (install or python) and not from_bundle:
-        raise BadParameter(f"--install is for a bundle, and {place} is not one; leave it out")
+    if not from_bundle and (
+        useless := " and ".join(option for option, given in (("--install", install), ("--python", python)) if given)
+    ):
+        raise BadParameter(f"only a bundle flies in a new environment, and {place} is not one; leave out {useless}")
     if python and not install:
         raise BadParameter("--python is for the environment that --install makes; leave it out, or give --install")
     with plugin.names_only(not trust):

@@ -323,7 +323,7 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
             try:
                 while not (await asyncio.wait([copy], timeout=STALL_S))[0]:
                     if not moved.is_set():
-                        raise HostsError(f"no data for {STALL_S:g} s; what was received is in {part}")
+                        raise HostsError(f"{link.name}: no data for {STALL_S:g} s; what was received is in {part}")
                     moved.clear()
             finally:
                 copy.cancel()

@@ -74,15 +74,15 @@ def is_unread(stream: int) -> bool:
 def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOSED) -> None:
     """Redirect further output, except of streams that write to a file, to the file `log`; drop it if that fails."""
     try:
-        into = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    except OSError:
-        into = os.open(os.devnull, os.O_WRONLY)
+        into, where = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), f"goes to {log}"
+    except OSError as error:
+        into, where = os.open(os.devnull, os.O_WRONLY), f"is lost, because {log} cannot be written ({error.strerror})"
     lost = []
     for stream in streams:
         with contextlib.suppress(OSError):  # the stream is not open at all
             lost += [] if stat.S_ISREG(os.fstat(stream).st_mode) else [stream]
     if lost:
-        write_error(f"{why}; further output goes to {log} if it can be written")
+        write_error(f"{why}; further output {where}")
     for stream in lost:
         os.dup2(into, stream)
     os.close(into)

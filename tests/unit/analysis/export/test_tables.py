@@ -184,7 +184,7 @@ def test_matlab_names_are_valid_and_unique() -> None:
 def test_a_variable_too_large_for_matlab_is_refused(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(make_export, "VARIABLE_MAX", 100_000)
     estimates = MessageSelection(("drone/*/estimate",))
-    with refused(ReportError, "estimate", "GB", "MATLAB", "--keys", "--from", "--to"):
+    with refused(ReportError, "estimate", "GiB", "MATLAB", "--keys", "--from", "--to"):
         export(run, Format.MAT, tmp_path / "all.mat", estimates)
     assert not list(tmp_path.iterdir())
     done = export(run, Format.MAT, tmp_path / "some.mat", estimates._replace(from_s=1.0, to_s=1.1))

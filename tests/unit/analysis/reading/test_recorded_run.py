@@ -222,6 +222,18 @@ def test_a_link_is_summarised_over_all_drivers_of_its_drone(tmp_path: Path):
     assert str(unknown["drone3"]).split(", ")[0] == PEER
 
 
+@pytest.mark.parametrize(
+    ("lost", "refused", "text"),
+    [
+        (0, 0, "never lost"),
+        (1, 1, "lost once, for 1.5 s, 1 message refused"),
+        (2, 5, "lost 2 times, for 1.5 s, 5 messages refused"),
+    ],
+)
+def test_a_link_is_shown_with_its_losses_in_singular_or_plural(lost: int, refused: int, text: str):
+    assert str(DriverLink(PEER, None, None, None, None, lost, 1.5, refused)) == f"{PEER}, {text}"
+
+
 def test_a_run_with_a_link_can_be_compared_with_one_without(tmp_path: Path):
     directories = [tmp_path / name for name in ("simulated", "mixed")]
     for directory in directories:

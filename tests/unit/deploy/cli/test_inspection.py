@@ -225,9 +225,11 @@ OURS = f"{MODE}: drone1 flies"
         ([command_event(0, 40_000_000), clock_at(60_000_000)], 0, "", ""),
         ([OTHERS, command_event(0, 40_000_000), clock_at(60_000_000)], 0, "", ""),
         ([command_event(0, 40_000_000), refusal_event(1), clock_at(60_000_000)], 1, OURS, ""),
-        ([refusal_event(0, "drone/drone2/cmd/mode"), clock_at(20_000_000, "paused")], 0, "", "paused"),
+        ([refusal_event(0, "drone/drone2/cmd/mode"), clock_at(20_000_000, "paused")], 0, "", "paused; the outcome"),
+        ([clock_at(20_000_000)], 0, "", "not known after 3 s; the state of the world is running"),
+        ([clock_at(20_000_000, "stopped")], 0, "", "not known after 3 s; the state of the world is stopped"),
     ],
-    ids=["refused at once", "carried out", "another's refused", "refused when due", "not known"],
+    ids=["refused at once", "carried out", "another's refused", "refused when due", "paused", "running", "stopped"],
 )
 def test_the_outcome_of_a_command_is_reported(
     monkeypatch: pytest.MonkeyPatch, answers: list[msgspec.Struct], refused_count: int, reason: str, note: str

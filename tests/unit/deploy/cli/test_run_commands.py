@@ -163,6 +163,15 @@ def test_a_failed_rerun_or_sweep_ends_with_the_reason(
     assert has_terms(capsys.readouterr().err.splitlines()[-1], "2", "too heavy")
 
 
+@pytest.mark.parametrize("options", [("--install",), ("--python",), ("--install", "--python")])
+def test_options_of_an_environment_are_refused_by_name_without_a_bundle(options: tuple[str, ...], tmp_path: Path):
+    with pytest.raises(typer.BadParameter) as raised:
+        run_commands.rerun(
+            tmp_path, install="--install" in options, python=Path("python3.11") if "--python" in options else None
+        )
+    assert raised.value.message.endswith(f"leave out {' and '.join(options)}")
+
+
 @pytest.fixture
 def formats(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
     """Return the requested formats of reports, none of which is made."""

@@ -199,7 +199,7 @@ def test_a_fetched_file_may_take_longer_than_the_stall_timeout(tmp_path: Path, m
 @pytest.mark.parametrize(
     ("get", "terms", "left"),
     [
-        (for_ever, ("no data", "0.05 s"), ["run.mcap.part"]),
+        (for_ever, ("h2", "no data", "0.05 s"), ["run.mcap.part"]),
         (None, ("h2", "no answer", "0.05 s"), []),
         (raising(asyncssh.SFTPPermissionDenied("Permission denied")), ("h2", os.strerror(errno.EACCES)), []),
     ],

@@ -1,5 +1,6 @@
 """The supervision of a run's processes, with fakes that end as scripted; signals, and a closed terminal."""
 
+import errno
 import json
 import os
 import signal
@@ -476,6 +477,24 @@ def test_a_terminal_that_still_exists_shows_where_output_continues(tmp_path: Pat
     assert output == ""
     assert has_terms(complained, "terminal", "closed", str(log))
     assert log.read_text().splitlines() == ["fetching", "ended"]
+
+
+def test_output_that_cannot_be_kept_is_said_to_be_lost(tmp_path: Path) -> None:
+    log = tmp_path / "missing" / "up.log"
+    with subprocess.Popen(
+        [sys.executable, "-c", TALKS, str(log)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as talker:
+        assert talker.stdout
+        assert talker.stdout.readline() == "ready\n"
+        talker.send_signal(signal.SIGHUP)
+        output, complained = talker.communicate("\n", timeout=60.0)
+    assert (talker.returncode, output) == (0, "")
+    assert has_terms(complained, "output is lost", str(log), os.strerror(errno.ENOENT))
+    assert "goes to" not in complained
 
 
 LOOKS = """
