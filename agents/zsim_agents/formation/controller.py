@@ -36,8 +36,9 @@ class Controller(Agent):
     def __init__(self, info: messages.Info, scenario: Scenario, cluster: str) -> None:
         super().__init__()
         if cluster not in {c.name for c in scenario.clusters}:
-            known = ", ".join(c.name for c in scenario.clusters) or "none"
-            raise RunError(f"controller: cluster is {cluster!r}; must be one of {known}")
+            known = ", ".join(c.name for c in scenario.clusters)
+            allowed = f"must be one of {known}" if known else "the scenario has none"
+            raise RunError(f"controller: cluster is {cluster!r}; {allowed}")
         spec = scenario.cluster(cluster)
         self.name = f"controller.{cluster}"
         self.period_ns = info.gate_ns

@@ -111,10 +111,10 @@ class FmuAgent(Agent):
         formation = cache(partial(Formation, scenario))
         mapping = mapping_of(model, fmu.map, info, fmu.drone, lambda cluster: formation(cluster).names)
         if not mapping.outputs:
-            output_names = (
-                ", ".join(each.name for each in model.variables.values() if each.causality == "output") or "none"
-            )
-            raise RunError(f"{fmu.path}: maps no output; must map at least one of {output_names}")
+            output_names = [each.name for each in model.variables.values() if each.causality == "output"]
+            if not output_names:
+                raise RunError(f"{fmu.path}: the FMU has no output; must have at least one")
+            raise RunError(f"{fmu.path}: maps no output; must map at least one of {', '.join(output_names)}")
         self._inputs = mapping.inputs
         self._formations = {
             key: formation(keys.thing(key))

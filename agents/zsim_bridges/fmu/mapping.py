@@ -194,10 +194,8 @@ class _PlaceParser:
         kind, thing, _ = keys.parts(key)
         known = {"drone": self._drones, "cluster": self._clusters}.get(kind)
         if known is not None and thing not in known:
-            hint = suggestion(thing, known)
-            raise RunError(
-                f"{context}: there is no {kind} {thing!r}; {hint}must be one of {', '.join(known) or 'none'}"
-            )
+            allowed = f"{suggestion(thing, known)}must be one of {', '.join(known)}" if known else "the run has none"
+            raise RunError(f"{context}: there is no {kind} {thing!r}; {allowed}")
         return self._field(text, key, path, is_output, context)
 
     def _drone_key(self, drone: str, leaf: str, is_output: bool) -> str | None:

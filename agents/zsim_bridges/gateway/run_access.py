@@ -191,7 +191,8 @@ class RunAccess:
         kind, thing, _ = keys.parts(key.removeprefix("view/"))
         names = self._known_names.get(kind)
         if names is not None and (messages.type_of(key) or is_control_key(key)) and thing not in names:
-            raise UnknownError(f"{key[:80]}: {kind} is {thing[:40]!r}; must be one of {', '.join(names) or 'none'}")
+            allowed = f"must be one of {', '.join(names)}" if names else "the run has none"
+            raise UnknownError(f"{key[:80]}: {kind} is {thing[:40]!r}; {allowed}")
         if kind == "estimates" and not keys.PROCESS_NAME.fullmatch(thing):
             raise UnknownError(f"{key[:80]}: process is {thing[:60]!r}; must be 1 to 48 characters of a-z 0-9 _ . -")
 

@@ -210,6 +210,7 @@ REFUSALS: list[tuple[Any, dict[str, Any], tuple[str, ...]]] = [
     ({"vx": "mode.fly"}, {}, ("'fly'", "takeoff", "land", "emergency", "reset")),
     ({"vx": "drone7/velocity_m_s.0"}, {}, ("vx=drone7/velocity_m_s.0", "drone7/velocity_m_s")),
     ({"x": "drone/drone7/estimate.yaw_rad"}, {}, ("'drone7'", "drone1?")),
+    ({"x": "cluster/main/state.margin"}, {}, ("'main'", "the run has none")),
     ({"x": "estimate.sensors"}, {}, ("x=estimate.sensors", "sensors")),
     ({"x": "status.state"}, {}, ("x=status.state", "text", "number")),
     ({"crash": "estimate.yaw_rad"}, {}, ("crash=estimate.yaw_rad", "number", "boolean")),
@@ -233,6 +234,12 @@ def test_a_bad_mapping_or_option_is_refused_in_one_line(
     with refused(RunError, *terms) as raised:
         flight(Fmu(everything, **{"drone": "drone1", "map": mapping, **more}))
     assert "\n" not in str(raised.value)
+
+
+def test_an_fmu_without_outputs_is_refused(tmp_path: Path) -> None:
+    path = fmus.build(tmp_path, "Silent", 3, 'variable("x", 0.0, I)', "pass")
+    with refused(RunError, "Silent.fmu", "the FMU has no output"):
+        flight(Fmu(path, "drone1", {"x": "estimate.yaw_rad"}))
 
 
 def test_a_file_that_is_not_a_usable_fmu_is_refused(tmp_path: Path, waypoint: Path) -> None:
