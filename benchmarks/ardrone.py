@@ -117,7 +117,7 @@ def _measured(endpoint: str, served: Server, drones: int, seconds: float) -> dic
     _await_navdata(pilots)
     pilots.hover_all()
     with _client(endpoint) as one, _client(endpoint) as other:
-        pid = served._process.pid
+        pid = served.pid
         packets, ticks, wall_s = dict(pilots.packets), _ticks(pid), time.monotonic()
         ages_ms = _ages_ms(one, pilots, seconds)
         spent_s = time.monotonic() - wall_s

@@ -24,7 +24,7 @@ def result(command: Sequence[str], timeout_s: float) -> dict[str, Any]:
     """Run a command in the project's folder and return the last line of JSON that it prints.
 
     Raises:
-        RefusedError: the command printed no line of JSON, or did not end in time.
+        RefusedError: the command failed, printed no line of JSON, or did not end in time.
     """
     with tempfile.TemporaryFile("w+") as errors:
         process = _started(command, errors, stdin=subprocess.DEVNULL)
@@ -35,7 +35,7 @@ def result(command: Sequence[str], timeout_s: float) -> dict[str, Any]:
         finally:
             _end(process)
         lines = [text for text in printed.splitlines() if text.startswith("{")]
-        if not lines:
+        if process.returncode or not lines:
             raise RefusedError(_last_words(errors, process.returncode))
         return json.loads(lines[-1])
 

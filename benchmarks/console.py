@@ -44,7 +44,6 @@ PAIRS = 8  # windows with a console per run, each between two without
 TIMEOUT_S = 300.0
 LOOK_S = 0.2
 GOALS = {3: 15.0, 50: 60.0}  # maximum percentage of a core, by number of drones
-LEAST_RATIO = 0.9
 PICTURES_HZ = {3: 20.0, 50: 10.0}  # picture rate of the console, by number of drones
 LEAST_PICTURES = 0.8  # minimum share of these pictures; a starved console draws fewer and seems cheap
 LEAST_RATE = 0.9  # minimum real-time factor; a slower run gives the console less to draw

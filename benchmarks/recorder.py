@@ -1,7 +1,8 @@
 """Part i: the recorder in a federation of 50 drones: whether it records everything, and what share of a core it takes.
 
 Missing messages are found by `seq`, which counts from 0 without gaps on every key except views. The share is processor
-time divided by wall time from the first recorded megabyte to the end of the run, which excludes start-up.
+time divided by wall time from the first recorded megabyte to the end of the run, which excludes start-up; messages and
+bytes per second are those of the same time.
 """
 
 import subprocess
@@ -47,8 +48,8 @@ class Flown(NamedTuple):
         cpu_s: processor time while the run was under way.
         wall_s: wall time while the run was under way.
         sim_s: simulated time of the complete run.
-        messages: number of recorded messages.
-        size_bytes: size of the record.
+        messages: number of recorded messages of the complete run.
+        timed_messages, timed_bytes: recorded while the run was under way.
         faults: what is wrong with each faulty key: a message that does not decode, a break in `seq` (for views, which
             may skip, only repetitions and steps back), or an early end.
         missing: number of values of `seq` that were not recorded, views excluded.
@@ -58,9 +59,18 @@ class Flown(NamedTuple):
     wall_s: float
     sim_s: float
     messages: int
-    size_bytes: int
+    timed_messages: int
+    timed_bytes: int
     faults: dict[str, str]
     missing: int
+
+
+class Look(NamedTuple):
+    """The time since the epoch, the recorder's processor time, and the size of the record."""
+
+    wall_ns: int
+    cpu_s: float
+    size_bytes: int
 
 
 def fly(drones: int, seconds: float, *options: str) -> Flown:
@@ -73,7 +83,7 @@ def fly(drones: int, seconds: float, *options: str) -> Flown:
         scenario, out = Path(temporary) / "grid.yaml", Path(temporary) / "run"
         grid.write(scenario, drones, seconds)
         command = [*CLI, "run", str(scenario), "--hosted", "--no-report", "--out", str(out), *options]
-        looks: list[tuple[float, float]] = []
+        looks: list[Look] = []
         with tempfile.TemporaryFile("w+") as said:
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said, text=True)
             try:
@@ -85,14 +95,22 @@ def fly(drones: int, seconds: float, *options: str) -> Flown:
             said.seek(0)
             if process.returncode or len(looks) < 2:
                 raise RefusedError(f"zsim run: exit code {process.returncode}: {said.read().strip()[-200:]}")
-        faults, missing, messages, last_ns = counted(out / "run.mcap")
-        (first_wall_s, first_cpu_s), (wall_s, cpu_s) = looks[0], looks[-1]
-        size = (out / "run.mcap").stat().st_size
-        return Flown(cpu_s - first_cpu_s, wall_s - first_wall_s, last_ns / 1e9, messages, size, faults, missing)
+        first, last = looks[0], looks[-1]
+        found = counted(out / "run.mcap", first.wall_ns, last.wall_ns)
+        return Flown(
+            cpu_s=last.cpu_s - first.cpu_s,
+            wall_s=(last.wall_ns - first.wall_ns) / 1e9,
+            sim_s=found.last_ns / 1e9,
+            messages=found.messages,
+            timed_messages=found.timed_messages,
+            timed_bytes=last.size_bytes - first.size_bytes,
+            faults=found.faults,
+            missing=found.missing,
+        )
 
 
-def _looks(launcher: subprocess.Popen[str], record: Path) -> Iterator[tuple[float, float]]:
-    """Yield wall time and the recorder's processor time [s] every LOOK_S while the run is under way."""
+def _looks(launcher: subprocess.Popen[str], record: Path) -> Iterator[Look]:
+    """Look every LOOK_S while the run is under way."""
     recorder: psutil.Process | None = None
     until_s = time.monotonic() + TIMEOUT_S
     while launcher.poll() is None and time.monotonic() < until_s:
@@ -100,7 +118,7 @@ def _looks(launcher: subprocess.Popen[str], record: Path) -> Iterator[tuple[floa
         if recorder is not None and record.exists() and record.stat().st_size > BEGUN_BYTES:
             with suppress(psutil.NoSuchProcess):
                 spent = recorder.cpu_times()
-                yield time.monotonic(), spent.user + spent.system
+                yield Look(time.time_ns(), spent.user + spent.system, record.stat().st_size)
         time.sleep(LOOK_S)
 
 
@@ -112,16 +130,27 @@ def _recorder(launcher: int) -> psutil.Process | None:
         return None
 
 
-def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
-    """Return faults by key, number of missing values of `seq`, number of messages, and the last message's time [ns]."""
+class Counted(NamedTuple):
+    """What is in a record; see `Flown`. `last_ns`: simulated time of the last message."""
+
+    faults: dict[str, str]
+    missing: int
+    messages: int
+    timed_messages: int
+    last_ns: int
+
+
+def counted(path: Path, from_ns: int, to_ns: int) -> Counted:
+    """Count the messages of a record; timed are those recorded between these times since the epoch."""
     expected: dict[str, int] = {}
     faults: dict[str, str] = {}
     ends_ns: dict[str, int] = {}
-    missing = messages = last_ns = 0
+    missing = messages = timed = last_ns = 0
     decoder = msgspec.msgpack.Decoder(_Seq)
     with RecordReader(path) as reader:
         for message in reader.messages(by_time=False):
             messages, last_ns = messages + 1, max(last_ns, message.t_ns)
+            timed += from_ns < message.wall_ns <= to_ns
             try:
                 seq = decoder.decode(message.payload).seq
             except REFUSALS:
@@ -134,7 +163,7 @@ def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
             if seq < wanted or (seq > wanted and not may_skip):
                 faults.setdefault(message.key, f"{seq} follows {wanted - 1}")
                 missing += max(0, seq - wanted)
-    return faults | _cut_short(ends_ns, last_ns), missing, messages, last_ns
+    return Counted(faults | _cut_short(ends_ns, last_ns), missing, messages, timed, last_ns)
 
 
 def _cut_short(ends_ns: Mapping[str, int], last_ns: int) -> dict[str, str]:
@@ -163,8 +192,8 @@ def _measured(sheet: Sheet, name: str) -> str:
     wall_s = flown.wall_s
     values = (
         100.0 * flown.cpu_s / wall_s,
-        flown.messages / wall_s,
-        flown.size_bytes / wall_s / 1e6,
+        flown.timed_messages / wall_s,
+        flown.timed_bytes / wall_s / 1e6,
         float(flown.missing),
         float(len(flown.faults)),
     )

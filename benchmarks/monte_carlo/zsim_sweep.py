@@ -24,7 +24,7 @@ def fly(runs: int, workers: int, duration_s: float | None = None) -> dict[str, f
     """Fly a sweep over seeds; return wall and CPU seconds, start-up included, and the drones' closest approach.
 
     Raises:
-        RefusedError: the sweep or one of its runs failed.
+        RefusedError: the sweep or one of its runs failed, or the sweep did not end in time.
     """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "sweep"
@@ -32,7 +32,10 @@ def fly(runs: int, workers: int, duration_s: float | None = None) -> dict[str, f
         command += ["--no-report", "--out", str(folder)]
         command += [] if duration_s is None else ["--duration", str(duration_s)]
         start_s, spent_s = time.perf_counter(), _children_cpu_s()
-        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+        except subprocess.TimeoutExpired:
+            raise RefusedError(f"zsim sweep: not finished after {TIMEOUT_S:g} s") from None
         found = {"wall_s": time.perf_counter() - start_s, "cpu_s": _children_cpu_s() - spent_s}
         if done.returncode:
             raise RefusedError(f"zsim sweep: exit code {done.returncode}: {done.stderr.strip()[-160:]}")

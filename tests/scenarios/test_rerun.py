@@ -118,7 +118,7 @@ def test_a_steered_run_is_rerun_with_the_operator_s_inputs(steered: Federation, 
     whole = (steered.out / "run.mcap").read_bytes()
     (cut / "run.mcap").write_bytes(whole[: len(whole) * 3 // 4])
     text = rerun(steered, of=cut)
-    found = re.search(r"the record was cut and has no truth_sha256; truth is the same at all (\d+) instants", text)
+    found = re.search(r"the record was cut and has no truth_sha256; truth is bit-identical at all (\d+) instants", text)
     assert found
     assert 350 < int(found[1]) <= len(steered.record().all("drone/drone1/truth"))
 

@@ -130,7 +130,7 @@ REFUSED: dict[bytes, tuple[str, ...]] = {
     b'{"op": "put", "key": "@batch", "value": 1}': ("@batch: ", "drone/…/cmd/…"),
     b'{"op": "put", "key": "a/*", "value": 1}': ("'a/*'",),
     b'{"op": "put", "key": "a//b", "value": 1}': ("key is 'a//b'", "must be a/b"),
-    b'{"op": "put", "key": "mine", "value": 36893488147419103232}': ("mine: ", "64 bits"),
+    b'{"op": "put", "key": "mine", "value": 36893488147419103232}': ("mine: ", "64-bit"),
     b'{"op": "subscribe", "key": "a//b"}': ("key is 'a//b'", "must be a/b"),
     b'{"op": "unsubscribe", "key": "clock"}': ("unsubscribe: ", "'clock'"),
     b'{"op": "join", "name": "a", "period_s": 0.021}': ("join: period_s is 0.021", "0.02"),

@@ -29,6 +29,6 @@ def test_two_minutes_are_recorded_without_a_gap(compiled: None, options: tuple[s
     flown = fly(DRONES, 120.0, *options)
     print(
         f"\n{' '.join(options) or 'lockstep'}: {100 * flown.cpu_s / flown.wall_s:.0f} % of a core, "
-        f"{flown.messages / flown.wall_s:.0f} messages/s, {flown.size_bytes / flown.wall_s / 1e6:.1f} MB/s"
+        f"{flown.timed_messages / flown.wall_s:.0f} messages/s, {flown.timed_bytes / flown.wall_s / 1e6:.1f} MB/s"
     )
     complete(flown, 120.0)

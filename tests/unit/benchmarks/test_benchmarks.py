@@ -8,12 +8,15 @@ from types import SimpleNamespace
 import pytest
 from refused import has_terms, refused
 
-from benchmarks import grid, lockstep, peers, table
+from benchmarks import grid, lockstep, peers, recorder, table
 from benchmarks.child import RefusedError, Server, result
 from benchmarks.exchange.lap import Lap
 from benchmarks.run import role_of
 from benchmarks.sheet import Sheet, Spread, exponent, read
 from benchmarks.table import figure, ratios, spread
+from zsim.contract import keys
+from zsim.contract.run_messages import Clock
+from zsim.record import RecordWriter
 from zsim_deploy.launch import role_launcher
 
 ECHO = """
@@ -50,6 +53,22 @@ def test_a_ratio_compares_each_repeat_with_the_same_repeat(tmp_path: Path) -> No
         failed.add("other", 1, theirs)
     assert failed.ratio("zsim", "other", 1) == Spread(3.0, 3.0, 3.0)
     assert failed.spread("other", 1) == Spread(10.0, 10.0, 10.0)
+
+
+def test_rates_of_the_recorder_are_those_of_the_time_that_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for seq in range(10):
+            writer.add_message(keys.CLOCK, Clock(20 * seq, seq, "run", seq, "running", 1.0), 100 * seq)
+    counted = recorder.counted(tmp_path / "run.mcap", 300, 700)
+    assert counted == ({}, 0, 10, 4, 180)
+    flown = recorder.Flown(1.0, 2.0, 20.0, 10_000, 6_000, 4_000_000, {}, 0)
+    monkeypatch.setattr(recorder, "fly", lambda *_: flown)
+    made = Sheet("i", "of a core")
+    recorder._measured(made, "lockstep")
+    found = [made.spread(f"lockstep_{field}", recorder.DRONES) for field in recorder.FIELDS[:3]]
+    assert found == [Spread(value, value, value) for value in (50.0, 3000.0, 2.0)]
 
 
 @pytest.mark.parametrize("power", [0.0, 1.0, 1.7])
@@ -90,6 +109,8 @@ def test_only_the_measured_section_of_the_page_is_replaced() -> None:
 def test_a_failed_contender_is_reported_with_its_error() -> None:
     with refused(RefusedError, "code 1", "ValueError: no"):
         result([sys.executable, "-c", "raise ValueError('no')"], 30.0)
+    with refused(RefusedError, "code 3", "too late"):
+        result([sys.executable, "-c", "import sys; print('{}'); print('too late', file=sys.stderr); sys.exit(3)"], 30.0)
     with refused(RefusedError, "0.2 s"):
         result([sys.executable, "-c", "input() if False else __import__('time').sleep(60)"], 0.2)
 

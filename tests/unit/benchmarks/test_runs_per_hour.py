@@ -97,6 +97,12 @@ def test_the_world_alone_follows_the_path_of_a_flight(tmp_path: Path) -> None:
     assert found["closest_m"] > 2.0
 
 
+def test_a_sweep_that_does_not_end_in_time_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zsim_sweep, "TIMEOUT_S", 0.1)
+    with refused(RefusedError, "not finished", "0.1 s"):
+        zsim_sweep.fly(runs=1, workers=1)
+
+
 def test_a_sweep_is_timed_with_the_cpu_time_of_its_workers() -> None:
     found = zsim_sweep.fly(runs=1, workers=1, duration_s=1.0)
     assert found["wall_s"] > 0.1
