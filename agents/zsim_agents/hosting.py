@@ -124,7 +124,7 @@ def check_plans(scenario: Scenario, source: str) -> None:
 
 
 def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
-    """Return the matching agents of all roles as one; RunError: none match, or the scenario is impossible."""
+    """Return the matching agents of all roles as one; RunError: none match, or the scenario cannot be flown."""
     split = [name.partition(".") for name in agents_of(scenario, patterns)]
     by_role = {role: [member for each, _, member in split if each == role] for role in agent_roles(scenario)}
     members = [agent for role, names in by_role.items() if names for agent in make_agents(role, info, scenario, names)]
@@ -239,7 +239,7 @@ def own_agent(
         try:
             accepted = signature(source)
         except ValueError as error:  # a partial whose arguments the class does not take
-            raise RunError(f"{kind} cannot be made: {error}") from None
+            raise RunError(f"{kind} cannot be called: {error}") from None
         given = {"info": info, "scenario": scenario, per: name.partition(".")[2]}
         given = {key: value for key, value in given.items() if key in accepted.parameters}
         make: Callable[..., Agent] = source
@@ -250,7 +250,7 @@ def own_agent(
         try:
             accepted.bind(**given)
         except TypeError as error:
-            raise RunError(f"{kind} takes {accepted}, and cannot be made: {error}") from None
+            raise RunError(f"{kind} takes {accepted}, and cannot be called with these settings: {error}") from None
         try:
             source = make(**given)
         except plugin.RAISED as error:

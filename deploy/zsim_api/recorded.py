@@ -201,7 +201,7 @@ class Run:
         """Return estimate − truth of a drone over time: position in W and heading, the σ of each as stated by the
         estimator (`sigma_position_m_x`), and `nees`, which is 6 on average for a consistent estimator.
 
-        If there are more than 200 000 estimates in all, only those at every n-th gate are compared.
+        If all drones together have 200 000 estimates or more, only those at every n-th gate are compared.
 
         Raises:
             RunError: no such drone, or the record lacks its truth or its estimates.
@@ -508,7 +508,7 @@ def _statistics(
     rows: Mapping[str, Mapping[str, tuple[Any, ...]]],
     fields: Sequence[str] = ("std", "rms", "mean", "inside"),
 ) -> "DataFrame":
-    """Return a frame with a row for each variable of each cluster or drone: its unit, and numbers or None."""
+    """Return a frame with a row for each variable of each cluster or drone: its unit, and numbers or NaN."""
     flat = [(name, variable, *values) for name, variables in rows.items() for variable, values in variables.items()]
     names = (index_name, "variable", "unit", *fields)
     texts = 3

@@ -46,7 +46,7 @@ def run_directory(out: Path | None, scenario: Scenario, force: bool = False) -> 
     """
     if out is None:
         out = _new_directory(f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}")
-    with file_fault(out, "cannot be made", OTHER_OUT):
+    with file_fault(out, "cannot be created", OTHER_OUT):
         if not out.exists():
             out.mkdir(parents=True, exist_ok=True)
             _MADE.add(out.resolve())
@@ -82,7 +82,7 @@ def locked(folder: Path) -> Iterator[Path]:
 def _new_directory(name: str) -> Path:
     """Create a folder in `runs` that no other run uses, since several may start within one second."""
     folder = first = Path("runs") / name
-    with file_fault(first, "cannot be made", OTHER_OUT):
+    with file_fault(first, "cannot be created", OTHER_OUT):
         for number in count(2):
             try:
                 folder.mkdir(parents=True)
@@ -95,7 +95,7 @@ def _new_directory(name: str) -> Path:
 
 def _make_room(out: Path, force: bool) -> None:
     """Raise RunError for a folder with a run or other files; with `force`, remove the run."""
-    with file_fault(out, "cannot be made", OTHER_OUT):
+    with file_fault(out, "cannot be created", OTHER_OUT):
         if force:
             _remove_run(out)
         elif any((out / JOURNAL).glob("*.entries")):

@@ -100,7 +100,7 @@ def test_a_stopped_estimator_is_reported_rather_than_its_controller(watched: Wat
 
 def test_a_stopped_world_is_reported(watched: Watched) -> None:
     watched.stop("world")
-    watched.run.line(f"world .pid {watched.federation.pid('world')}. shows no sign of life")
+    watched.run.line(f"world .pid {watched.federation.pid('world')}. has shown no sign of life")
     watched.federation.kill("world", signal.SIGCONT)
     watched.run.line("world .* is back")
     watched.goes_on()

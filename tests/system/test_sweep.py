@@ -216,7 +216,7 @@ BAD = {
     "no runs": (("--runs", "0"), "invalid value for '--runs'"),
     "workers and dask": (("--workers", "2", "--dask", "tcp://127.0.0.1:9"), "--workers"),
     "no scheduler": (("--dask", "nonsense://127.0.0.1:9"), "--dask nonsense://127.0.0.1:9: no scheduler"),
-    "a file in the way": (("--out", __file__), "cannot be made"),
+    "a file in the way": (("--out", __file__), "cannot be created"),
 }
 
 

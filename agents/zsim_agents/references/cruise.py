@@ -1,6 +1,6 @@
-"""Tracking of a reference, cruise paths to goals, and courses of drones that receive new goals at any time. Pure.
+"""Tracking of a reference, cruise paths to goals, and courses of drones that receive new goals at any time. No I/O.
 
-The commanded velocity is the reference's, taken ahead by the lag of the drone's velocity loop, plus a gain times the
+The commanded velocity is the reference's, evaluated one lag of the drone's velocity loop ahead, plus a gain times the
 position error. To first order, the lead amounts to an acceleration feed-forward that needs no second derivative.
 
 A cruise path leads from any motion to rest at a goal, at a cruise speed and within limits of speed and acceleration.
@@ -11,7 +11,7 @@ Machines and Robots, Springer 2008, chapter 3.
 
 Let D lead from start to goal; then D - v t1/2 = q (t1/2 + t2 + t3/2). So t1 determines both the direction of q and its
 length: the cruise speed, or less where t2 would be negative, with |q|^2 / 2a + |q| t1/2 = |D - v t1/2|. t1 solves
-|q(t1) - v| = a t1. Since q(t1) is continuous and bounded, a solution exists, at most the time of the largest possible
+|q(t1) - v| = a t1. Since q(t1) is continuous and bounded, a solution exists, no later than the time of the largest
 change of velocity. Any velocity between two that satisfy the limits satisfies them too. Planned anew from any state
 on a path, the path to the same goal is the remainder of the old one.
 
@@ -303,7 +303,7 @@ def _segments(start: Vector, velocity: Vector, goal: Vector, bounds: _Bounds) ->
             middle = (low + t1) / 2.0
             (qx, qy, qz), _ = cruise_after(middle)
             low, t1 = (low, middle) if bounds.rise_s(qx - vx, qy - vy, qz - vz) <= middle else (middle, t1)
-    elif (rise_s := bounds.rise_s(x, y, z)) > 0.0:  # of the displacement as if a velocity; if t2 = 0, |q| t1 = |D|
+    elif (rise_s := bounds.rise_s(x, y, z)) > 0.0:  # with the displacement as velocity; if t2 = 0, |q| t1 = |D|
         t1 = min(math.sqrt(rise_s), rise_s * bounds.speed_along(x, y, z))
     (qx, qy, qz), over_s = cruise_after(t1)
     segments = []

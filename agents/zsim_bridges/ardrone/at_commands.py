@@ -49,7 +49,7 @@ class Ref(NamedTuple):
 
 
 class Pcmd(NamedTuple):
-    """Fly with fractions of the limits, in [-1, 1]: `roll` right, `pitch` backward, `gaz` up, `yaw` clockwise."""
+    """Fly at fractions of the limits, in [-1, 1]: `roll` right, `pitch` backward, `gaz` up, `yaw` clockwise."""
 
     sequence: int
     flag: int

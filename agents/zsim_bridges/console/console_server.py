@@ -59,7 +59,7 @@ EVENTS_MAX = 20  # maximum number of events in `state`
 SILENT = "silent"  # replaces the clock's state while the world does not answer
 FEW_DRONES = 20  # with this number of drones or more, the picture rate is halved
 RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
-FAST_RATE = 4.0  # × real time; likewise at this rate of the run or above, since the run needs the processors
+FAST_RATE = 4.0  # × real time; from this rate on, the picture rate is halved too: the run needs the processors
 
 
 class Console:
@@ -152,7 +152,7 @@ class Console:
         After OFFER_S, the console no longer waits for the copies.
 
         Args:
-            end_reason: returns the reason, None while there is none.
+            end_reason: returns the reason, or None while there is none.
             is_abandoned: returns whether to stop waiting for the pages' copies.
         """
         while not (reason := end_reason()):
@@ -307,7 +307,7 @@ class RunPage:
         return self.orders.place(request)
 
     def permits(self, client_id: int, control: str) -> bool:
-        """Return whether a page may use a shared control, which takes a free part; if not, show it the reason."""
+        """Return whether a page may use a shared control, and claim its part if it is free; if not, show the reason."""
         part = self._page.parts.get(control)
         refusal = "" if part is None else self.desk.use(client_id, part)
         if refusal and time.monotonic() - self._notified_s.get(client_id, -math.inf) > REFUSAL_S:
@@ -428,7 +428,7 @@ class RunPage:
     def _on_outcome(self, outcome: RequestOutcome) -> None:
         """Show a refusal in the corner of every page and among the events.
 
-        Also log the acceptance of a request to a formation, of which the world publishes no event, and of one whose
+        Also log the acceptance of a request to a formation, for which the world publishes no event, and of one whose
         completion can be observed.
         """
         if outcome.order and not self.orders.note(outcome):

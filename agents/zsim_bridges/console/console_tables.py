@@ -39,7 +39,7 @@ EVENT_COLOURS = {
 }
 LINK_COLOURS = {"waiting": AMBER, "connected": BLUE, "armed": GREEN, "lost": RED}
 SEVERITY_COLOURS = {"red": RED, "amber": AMBER}
-REMAINING_MAX_S = 24 * 3600.0  # a battery's maximum remaining time that is shown
+REMAINING_MAX_S = 24 * 3600.0  # longest remaining battery time that is shown
 COLUMNS = 8  # number of columns of the table of drones
 PITCH_PX_PER_DEG, PITCH_MAX_PX = 0.9, 36.0  # scale and limit of the artificial horizon
 NO_FAULT = "no active fault"
@@ -70,7 +70,7 @@ class DroneRow(NamedTuple):
 
     @property
     def link_badness(self) -> float:
-        """How bad an external drone's link, or another's lag, is: 1 at the alarm threshold, infinite without a link."""
+        """How bad an external drone's link, or another drone's lag, is: 1 at the alarm threshold, infinite without link."""
         drone = self.drone
         if not drone.is_external:
             return (drone.lag_ms or 0.0) / LAG_MAX_MS
@@ -170,7 +170,7 @@ def drone_table(
 
     Args:
         metrics: flight figures by drone.
-        selected: names of the drones that are selected for one command.
+        selected: names of the drones selected to receive the same command.
         chosen: name of the drone whose instruments are shown.
         empty: text shown if there are no rows.
     """
@@ -258,7 +258,7 @@ def metric_lines(metrics: FlightMetrics | None) -> str:
     instruments = _INSTRUMENTS.format(
         bank=f"{-metrics.roll_deg:.1f}",
         pitch_px=f"{max(-PITCH_MAX_PX, min(PITCH_MAX_PX, metrics.pitch_deg * PITCH_PX_PER_DEG)):.1f}",
-        course=f"{90.0 - metrics.heading_deg:.0f}",  # a heading counts from east to north; north is up on the compass
+        course=f"{90.0 - metrics.heading_deg:.0f}",  # headings are measured from east; compass courses, from north
         speed=f"{metrics.speed_m_s:.1f}",
         height=f"{z:.1f}",
         climb=f"{metrics.climb_m_s:+.1f}",
@@ -272,7 +272,7 @@ def metric_lines(metrics: FlightMetrics | None) -> str:
 def sensor_table(
     name: str, counts: Counts, rates: Mapping[str, float], uncertainty: str, own_rates: Mapping[str, float]
 ) -> str:
-    """Return the table of one drone's sensors: measurements that its estimator used and refused, and rates [Hz].
+    """Return the table of one drone's sensors: measurements that its estimator used and rejected, and rates [Hz].
 
     `own_rates` are the configured rates of the user's sensors [Hz], each of which has a row even if the estimator does
     not count it.
@@ -288,7 +288,7 @@ def sensor_table(
     head = _head(
         ("sensor", "sensor of the drone"),
         ("used", "measurements that its estimator used"),
-        ("refused", "measurements that were too unlikely or unusable"),
+        ("rejected", "measurements that were too unlikely or unusable"),
         ("rate", "rate of arrival in simulated time"),
     )
     rows = (_cells(escape(str(cell)) for cell in row) for row in (*counted, *uncounted))

@@ -1,4 +1,4 @@
-"""The condition of the run that pages show: alarms, checks before a take-off, refusals, and the page's head. Pure.
+"""The condition of the run that pages show: alarms, checks before a take-off, refusals, and the page's head. No I/O.
 
 An alarm is amber or red. A control on a page is disabled, and shows the reason, while its request would be refused.
 Such reasons are called refusals here; an empty one means that the request would be accepted.
@@ -66,7 +66,7 @@ class DroneCondition(NamedTuple):
     yaw_sigma_deg: float | None = None
     estimate_lost: bool = False
     tilt_deg: float | None = None
-    failsafe: str = ""  # why its firmware landed it or stopped its rotors without a command; empty if it did not
+    failsafe: str = ""  # why it landed by itself or its rotors were stopped; empty if neither
     commander: str | None = None
     is_external: bool = False
     link_age_s: float | None = None  # wall time since its driver last published the state of the link
@@ -105,7 +105,7 @@ def drone_alarms(drone: DroneCondition) -> list[Alarm]:
         add("red", "link lost")
         return alarms
     if (drone.link_age_ms or 0.0) > LINK_AGE_MAX_MS:
-        add("amber", "link old", f"{drone.link_age_ms:.0f} ms")
+        add("amber", "link stale", f"{drone.link_age_ms:.0f} ms")
     if (drone.link_loss_percent or 0.0) > LINK_LOSS_PERCENT:
         add("amber", "link loss", f"{drone.link_loss_percent:.0f} %")
     return alarms
@@ -413,7 +413,7 @@ class RunCondition(NamedTuple):
         return f"the world has not answered for {self.silent_s:.0f} s" if self.silent_s else ""
 
     def flight_refusal(self) -> str:
-        return self.outage() or ("a record is played back" if self.replayed else "")
+        return self.outage() or ("a record is being played back" if self.replayed else "")
 
     def all_down(self, names: Collection[str] | None = None) -> bool:
         """Return whether all drones seen so far, or the named ones, are on the ground."""
@@ -438,7 +438,7 @@ def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
     common = run.flight_refusal() or ("" if state else f"{drone} has not been seen yet")
     refusals = {mode: common or state_refusal(drone, state or "", mode) or "" for mode in modes}
     refusals["takeoff"] = refusals["takeoff"] or preflight_refusal(run, [drone])
-    # An emergency is possible whatever the drone's state, since the known one may be outdated.
+    # An emergency stop is possible whatever the drone's state, since the known one may be outdated.
     return {**refusals, "emergency": run.flight_refusal()}
 
 
@@ -452,7 +452,7 @@ def preflight_refusal(run: RunCondition, drones: Collection[str]) -> str:
 
 
 def is_held_by_fault(run: RunCondition, cluster: str) -> bool:
-    """Return whether a formation is held by a fault, not on request (even if the guard parts drones meanwhile)."""
+    """Return whether a formation is held by a fault, not on request (even if the guard moves drones apart)."""
     phase, reason = run.phases.get(cluster, ("", ""))
     on_request = any(note in reason for note in (HELD_ON_REQUEST, GUARD_PARTS)) and REJOINING not in reason
     return phase == "held" and not on_request
@@ -508,7 +508,7 @@ def _takeoff_refusal(run: RunCondition, cluster: str, phase: str) -> str:
 
 
 def _reset_first(stopped: Sequence[str]) -> str:
-    return f"{', '.join(stopped)} in emergency; reset first"
+    return f"{', '.join(stopped)} must be reset first: rotors stopped in an emergency"
 
 
 def fleet_refusals(run: RunCondition, single: Collection[str] = ()) -> dict[str, str]:
@@ -579,7 +579,7 @@ def page_head(
             title = f"EMERGENCY · {title}"
     phases = run.phases if len(run.phases) <= 1 and not (run.ended or run.silent_s) else {}
     formation = [f"{n}: {_phase_text(p)}{f' – {reason}' if reason else ''}" for n, (p, reason) in phases.items()]
-    lines = [name, "a record is played back" if run.replayed else "", detail, *formation]
+    lines = [name, "a record is being played back" if run.replayed else "", detail, *formation]
     refusals = {"land": fleet_refusals(run, single)["land"], "emergency": run.flight_refusal()}
     common = {"t_s": t_ns / 1e9, "replay": run.replayed, "age_s": run.silent_s, "alarms": list(alarms)}
     return {"level": level, "title": title, "detail": " · ".join(filter(None, lines)), "refusals": refusals, **common}

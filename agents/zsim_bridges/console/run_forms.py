@@ -45,7 +45,7 @@ ORDERS = ("hold", "land", "emergency")  # operations with an `OrderButton`
 
 
 class RunForm:
-    """Controls to pause, resume and step the run, and to set its rate; `rate` is the rate with which it was started."""
+    """Controls to pause, resume and step the run, and to set its rate; `rate` is the rate at which it was started."""
 
     def __init__(self, gui: viser.GuiApi, client: CommandClient, rate: float) -> None:
         pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
@@ -240,7 +240,7 @@ def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
     Every magnitude must be given, even one with a default: an empty text should not, say, affect all samples.
 
     Raises:
-        InputError: the text has another form, names a parameter that the kind does not have, or omits a magnitude.
+        InputError: the text is malformed, names a parameter that the kind does not have, or omits a magnitude.
     """
     prefix = f"parameters are {text[:40]!r}"
     try:
@@ -300,7 +300,7 @@ class InputError(ValueError):
 
 
 def range_refusal(name: str, value: float, low: float, high: float, unit: str = "") -> str | None:
-    """Return why a typed number is refused, None if it is within its limits; numbers are never clipped to them."""
+    """Return why a typed number is refused, or None if it is within its limits; numbers are never clipped to them."""
     if low <= value <= high:
         return None
     unit_text = f" {unit}" if unit else ""
@@ -329,7 +329,7 @@ def set_refusals(controls: Mapping[str, Any], refusals: Mapping[str, str]) -> No
 
 
 def offered_refusals(run: RunCondition, refusals_of: Callable[[RunCondition], Mapping[str, str]]) -> dict[str, str]:
-    """Return the refusals; orders are offered even while the world is silent, and emergencies always."""
+    """Return the refusals; orders are offered even while the world is silent, and emergency stops always."""
     orders = {op: reason for op, reason in refusals_of(run._replace(silent_s=0.0)).items() if op in ORDERS}
     if "emergency" in orders:
         orders["emergency"] = ""

@@ -21,7 +21,7 @@ from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, Session
 from zsim_bridges.console.run_condition import LOSS_NAMES, RETURN_KINDS, DroneCondition, Losses
 
-FRESH_S = 1.0  # simulated or wall; views arrive 20 times a wall second: an older one shows a dead or stuck estimator
+FRESH_S = 1.0  # simulated or wall; views arrive at 20 Hz (wall); an older one indicates a dead or stuck estimator
 FAULTS_KEPT = 8  # number of most recently begun faults that are kept
 EVENTS_KEPT = 200  # number of newest single events that are kept
 ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # numbers of rows kept: of distinct events; of the console's own requests
@@ -109,9 +109,9 @@ class ViewBuffer:
         self.faults: tuple[Fault, ...] = ()  # injected faults, planned and active
         self.log = EventLog(observer.name)
         self.losses = Losses()
-        self.failsafes: dict[str, Event] = {}  # last automatic landing or stop by drone, until another mode follows
+        self.failsafes: dict[str, Event] = {}  # by drone: last automatic landing or any stop, until another mode
         self.recent_faults: deque[Fault] = deque(maxlen=FAULTS_KEPT)  # the most recently begun faults
-        self.end = ""  # why the run ended, by its last event; empty while it continues
+        self.end = ""  # why the run ended, according to its last event; empty while it continues
         self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that the console causes
 
     def open(self) -> None:
@@ -144,7 +144,7 @@ class ViewBuffer:
         newest: dict[str, ReceivedEstimate] = {}
         for process, view in sorted(self.estimators.items(), key=lambda each: each[1].t_ns):
             age_s = self._received_s.get(keys.VIEW_DRONES, 0.0) - self._received_s[keys.estimates_view(process)]
-            # Neither view covers every gate.
+            # Neither view is published at every gate, so the two rarely carry the same time.
             is_fresh = abs(view.t_ns - now_ns) <= FRESH_S * 1e9 or abs(age_s) <= FRESH_S
             if is_fresh or view.t_ns <= now_ns:
                 known = (estimate for estimate in view.estimates if estimate.name in self._names)
@@ -259,7 +259,7 @@ class ViewBuffer:
                 self.recent_faults.append(msgspec.convert(event.data, Fault))
         elif event.kind == "end":
             self.end = event.text
-        if event.kind != "command":  # a more specific event, of a mode or a refusal, follows
+        if event.kind != "command":  # mode changes and refusals have events of their own; setpoints are not logged
             self.log.add(event)
         if event.source == self._observer.name:
             self.on_own_event(event)

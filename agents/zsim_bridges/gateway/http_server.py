@@ -63,7 +63,7 @@ from zsim_bridges.gateway.run_access import RunAccess, SharedSubscriptions
 from zsim_bridges.web import is_loopback_authority
 from zsim_bridges.web.web_server import tokens_match
 
-HTTP_RATE_HZ = 5_000.0  # requests per wall second from one address: 500 clients with ten requests a second each
+HTTP_RATE_HZ = 5_000.0  # requests per second of wall time from one address: 500 clients with ten requests a second each
 HTTP_BURST = 10_000.0
 METHODS = "GET, POST, PUT, PATCH, DELETE, OPTIONS"
 EVENT_STREAM = "text/event-stream"
@@ -96,7 +96,7 @@ _ERRORS = {
 
 
 class MissingTokenError(ForbiddenError):
-    """A request without the token."""
+    """A request without the token, or with a wrong one."""
 
 
 STATUS: tuple[tuple[type[ZsimError], int], ...] = (

@@ -570,7 +570,7 @@ class Parser:
     """Splits received datagrams into frames and decodes them.
 
     Args:
-        signing: checks signatures, which frames must then have; None to accept all frames unchecked.
+        signing: checks signatures, which frames must then have; None: signatures are neither required nor checked.
 
     Attributes:
         refused: number of refused frames by reason: `bad_crc`, `unknown` (not in the dialect), `incompatible` (unknown

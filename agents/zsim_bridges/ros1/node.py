@@ -71,7 +71,7 @@ class Ros1Node:
         self.subscribed[topic] = SubscribedTopic(topic_type_of(topic, kind), self.name, callback, self._say)
 
     def serve(self, name: str, action: Callable[[], str | None]) -> None:
-        """Offer a std_srvs/Empty service, before `running`. `action` returns why it failed, None if it succeeded."""
+        """Offer a std_srvs/Empty service, before `running`. `action` returns why it failed, or None if it succeeded."""
         self.services[name] = EmptyService(EMPTY_SERVICE._replace(name=name), action)
 
     @contextlib.asynccontextmanager
@@ -186,7 +186,7 @@ class SlaveApi:
         ]
 
     def getBusStats(self, caller: str) -> Answer:
-        """Return the bytes sent per topic, and for each connection its number, bytes, messages, and whether it is up.
+        """Return the bytes sent per topic, and of each connection number, bytes, the topic's messages, and state.
 
         Subscribed topics and services are not included.
         """
@@ -281,7 +281,7 @@ class SubscriberLink:
 
 
 class EmptyService:
-    """A service of type std_srvs/Empty; `action` returns why a request failed, None if it succeeded."""
+    """A service of type std_srvs/Empty; `action` returns why a request failed, or None if it succeeded."""
 
     def __init__(self, topic_type: "TopicType", action: Callable[[], str | None]) -> None:
         self.topic_type = topic_type
@@ -508,9 +508,9 @@ int32 temp              # 0.1 deg C
 float32 wind_speed      # m/s
 float32 wind_angle
 float32 wind_comp_angle
-float32 rotX            # deg, to the right positive
-float32 rotY            # deg, nose down positive
-float32 rotZ            # deg, counter-clockwise positive
+float32 rotX            # deg, positive to the right
+float32 rotY            # deg, positive nose down
+float32 rotZ            # deg, positive counter-clockwise
 int32 altd              # mm
 float32 vx              # mm/s
 float32 vy
@@ -558,14 +558,14 @@ def serialize(kind: str, message: Any) -> bytes:
     try:
         return bytes(_store.serialize_ros1(message, _full_name(kind)))
     except Exception as error:  # the generated writer may raise any exception for invalid values
-        raise ValueError(f"is not a {kind}: {error}") from error
+        raise ValueError(f"the message is not a valid {kind}: {error}") from error
 
 
 def deserialize(kind: str, data: bytes) -> Any:
     """Return the message encoded in `data`.
 
     Raises:
-        ValueError: `data` do not encode a message of this type.
+        ValueError: `data` does not encode a message of this type.
     """
     try:
         return _store.deserialize_ros1(data, _full_name(kind))

@@ -163,7 +163,7 @@ def hunt(request: HuntRequest) -> Hunted:
 
     Raises:
         ScenarioError: a requirement, a fault, a field or the scenario is wrong; one line for each.
-        RunError: the folder holds another hunt or other files, is in use or cannot be made, or workers cannot start.
+        RunError: the folder holds another hunt or other files, is in use or cannot be created, or workers cannot start.
         ReportError: the folder cannot be written.
     """
     texts, document = _with_functions(request.requirements, request.document)

@@ -128,14 +128,14 @@ def planned_figures(
         )
     if separation := distances(flight, PAIRS_MAX):
         pairing = (
-            "each pair of drones"
+            "the drones of each pair"
             if separation.pairs
-            else "each drone to the nearest other: median, 5 to 95 %, extremes"
+            else "each drone and the one nearest to it: median, 5 to 95 %, extremes"
         )
         yield PlannedFigure(
             "distances.png",
             "Distances between drones",
-            f"True distance of {pairing}; lines: the controllers' guard and alarm, and contact of two hulls.",
+            f"True distance between {pairing}; lines: the controllers' guard and alarm, and contact of two hulls.",
             partial(draw_distances, separation, separations(flight), colours, marks),
         )
     if tracking_errors := reference_errors(flight):
@@ -198,7 +198,11 @@ def _cluster_figures(
         partial(draw_errors, formation, window_s, marks, goal),
     )
     for file, number, group_name, names in parameter_groups(formation.names):
-        shown = ", ".join(names) if len(names) <= ROWS_MAX else f"those of {len(names)} variables that move most"
+        shown = (
+            ", ".join(names)
+            if len(names) <= ROWS_MAX
+            else f"values of those of the {len(names)} variables that move most"
+        )
         yield PlannedFigure(
             f"{file}{suffix}.png",
             f"{group_name}{numbered(number, paper)}",
@@ -266,7 +270,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Deadlines missed", misses),
         ("Command age", ages),
         *((f"Link of {drone}", str(link)) for drone, link in summary.links.items()),
-        ("Least separation", "no two drones in the air" if separation is None else f"{separation:.2f} m in truth"),
+        ("Least separation", "no two drones in the air" if separation is None else f"{separation:.2f} m (true)"),
         *([("Distance to obstacles", obstacle_text(nearest))] if nearest else []),
         *([("Radio", radio_text(radio))] if radio else []),
         ("Truth", f"SHA-256 {summary.truth_sha256}"),
@@ -282,7 +286,7 @@ def changed_text(changed: Sequence[str] | None) -> str:
 def obstacle_text(distances_m: Mapping[str, float]) -> str:
     """Describe the minimum distance of any drone from obstacles."""
     nearest = min(distances_m, key=lambda drone: distances_m[drone])
-    return f"at least {distances_m[nearest]:.2f} m in truth, of {nearest}, from its centre to a surface"
+    return f"at least {distances_m[nearest]:.2f} m, from the true centre of {nearest} to a surface"
 
 
 def radio_text(radio: RadioSummary) -> str:

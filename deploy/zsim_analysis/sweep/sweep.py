@@ -249,12 +249,12 @@ def load(path: Path) -> SweepFolder:
 def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFolder]:
     """Yield the folder of a new or continued sweep, locked against other sweeps.
 
-    With `force`, the folder may contain other files, but never a run or another sweep.
+    With `force`, the folder may contain other files, but never a run, or another sweep with finished runs.
 
     Raises:
         RunError: another sweep is running in the folder, or it contains something else.
     """
-    with file_fault(path, "cannot be made", OTHER_OUT):
+    with file_fault(path, "cannot be created", OTHER_OUT):
         if not is_sweep(path) and ((path / RECORD).exists() or (path / TABLE).exists()):
             raise RunError(f"{path}: holds another run or sweep; {OTHER_OUT}")
     with locked_folder(path, PLAN, (LOCK, NEW_PLAN), force, "sweep into", "another sweep is running"):

@@ -62,7 +62,7 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
     rms, std = list[Panel](), list[Panel]()
     for prefix, each in list(results.parameters.items())[:PANELS_MAX]:
         symbol = style.label(each.name).rpartition(" (")[0]
-        in_truth, estimated = f"RMS error of {symbol}\nin truth", f"std of the error of {symbol}\nas estimated"
+        in_truth, estimated = f"RMS of the true error\nof {symbol}", f"std of the error of {symbol}\nas estimated"
         rms.append(Panel(f"{prefix}.true_rms", each.labelled(f"{in_truth} ({unit(each.name)})")))
         printed = results.paper_std.get(each.name)
         std.append(Panel(f"{prefix}.est_std", each.labelled(f"{estimated} ({unit(each.name)})"), printed))
@@ -73,7 +73,7 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
     window = f" ({span_text(windows_s)})" if windows_s else ""
     hint = ""
     if results.design.points > POINTS_MAX and not GridAxis(results.design).field:
-        hint = f" The first {POINTS_MAX} points are shown; the tables have all."
+        hint = f" The first {POINTS_MAX} points are shown; the tables contain all of them."
     comparison = ", compared with the paper" if results.paper_std else ""
     for name, title, caption, panels in (
         ("metrics", "Your own metrics", f"What {results.metrics_function} returned for each run.", own),
@@ -98,7 +98,7 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
         yield style.ReportFigure(
             f"drawn_{i + 1}.png",
             f"Against {field_name(path)}",
-            f"Each quantity against the drawn value; means of {SLICES} slices with equally many runs.",
+            f"Each quantity against the drawn value; means of {SLICES} slices with equal numbers of runs.",
             _draw_slices(results, path, [*own, *rms]),
         )
 
@@ -385,7 +385,7 @@ def mark_beyond(axes: Axes, means: Sequence[DrawnMean], along: Literal["x", "y"]
 
 # The x axis of a grid
 
-POINTS_MAX = 24  # maximum number of points side by side in one panel; the tables have all
+POINTS_MAX = 24  # maximum number of points side by side in one panel; the tables contain all of them
 # colours of the combinations of those fields that are not on the axis
 SERIES = (style.BLUE, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.BLACK)
 DECADES_MIN = 30.0  # smallest ratio of the largest to the smallest value for a logarithmic axis

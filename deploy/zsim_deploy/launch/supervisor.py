@@ -101,7 +101,7 @@ class Supervisor:
         self._silent_s: float | None = None  # monotonic time at which a world without any output is reported
         self._dead: set[str] = set()
         self._lost: dict[str, int | None] = {}  # pid of each process that ended without a bye message, by name
-        self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and when they were (monotonic, s)
+        self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and when [s; monotonic]
         self._left: list[RunProcess] = []  # replaced processes that have ended or were killed
         self._world_watch = WorldWatch()
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
@@ -224,8 +224,8 @@ class Supervisor:
             self._release_replaced()
             if self._silent_s is not None and time.monotonic() > self._silent_s:
                 self._silent_s = None
-                silent = f"the world (pid {world.pid}) has not begun after {SILENT_S:g} s"
-                self._show.say(f"{silent}: {world.last_log_line() or 'its log is empty'}; the other processes wait")
+                silent = f"the world (pid {world.pid}) has not started within {SILENT_S:g} s"
+                self._show.say(f"{silent}: {world.last_log_line() or 'its log is empty'}; the others are waiting")
             if line := self._world_watch.change(time.monotonic(), world.pid):
                 self._show.say(line)
             on_poll()
@@ -408,10 +408,10 @@ class WorldWatch:
             return f"world (pid {pid}) is back"
         if self._ends_for:
             names = ", ".join(self._ends_for)
-            return f"world (pid {pid}) has ended and waits for {names}: stopped or out of reach"
+            return f"world (pid {pid}) has ended and is waiting for {names}, which may be stopped or out of reach"
         silent_s = now_s - self.last_s
         hint = f"kill -CONT {pid} continues it"
-        return f"world (pid {pid}) shows no sign of life for {silent_s:.1f} s: it is stopped ({hint}) or out of reach"
+        return f"world (pid {pid}) has shown no sign of life for {silent_s:.1f} s: stopped ({hint}) or out of reach"
 
 
 class EndSignals:
