@@ -76,7 +76,7 @@ def locked_folder(folder: Path, mark: str, own: Collection[str], force: bool, us
             refuse_others(folder, own, force, use)
         lock_file = (folder / ".lock").open("w")
     except OSError as error:
-        raise RunError(f"{folder}: cannot be made ({error.strerror}); give --out another folder") from error
+        raise RunError(f"{folder}: cannot be created ({error.strerror}); give --out another folder") from error
     with lock_file:
         if not take_lock(lock_file):
             raise RunError(f"{folder}: {others} there; give --out another folder")

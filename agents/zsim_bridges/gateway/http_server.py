@@ -476,7 +476,7 @@ def _other_paths() -> dict[str, Any]:
             "responses": _responses(_json_content({"$ref": _REF.format(name="ControlAnswer")})),
         }
         paths[f"{JSON_PREFIX}{key}"] = {
-            "parameters": [_name_parameter("cluster")] if "{cluster}" in key else [],
+            "parameters": [_name_parameter(name) for name in ("drone", "cluster") if f"{{{name}}}" in key],
             "post": post,
         }
 

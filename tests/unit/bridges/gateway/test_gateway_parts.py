@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
@@ -609,3 +610,8 @@ def test_a_part_has_its_headers_and_ends_with_the_boundary() -> None:
     assert rest == jpeg() + f"\r\n--{BOUNDARY}\r\n".encode()
     assert b"Content-Length: %d" % len(jpeg()) in head
     assert b"X-Timestamp: 0.016000" in head
+
+
+def test_every_path_of_the_openapi_description_declares_its_parameters() -> None:
+    for path, item in description()["paths"].items():
+        assert re.findall(r"\{(\w+)\}", path) == [each["name"] for each in item["parameters"]]
