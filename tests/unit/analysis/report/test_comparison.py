@@ -138,8 +138,8 @@ def test_notes_report_what_only_some_runs_have(runs: list[Path], tmp_path: Path)
         ("cut", "record", "cut"),
     ):
         assert has_terms(text, *terms)
-    assert not has_terms(text, "identical")
-    assert has_terms("\n".join(notes(twins(tmp_path, runs[0]))), "a/calm", "b/calm", "identical")
+    assert not has_terms(text, "bit-identical")
+    assert has_terms("\n".join(notes(twins(tmp_path, runs[0]))), "a/calm", "b/calm", "bit-identical")
 
 
 def twins(folder: Path, run: Path) -> list[ComparedRun]:
