@@ -234,7 +234,7 @@ def staged_outputs(*targets: Path) -> Iterator[tuple[Path, ...]]:
             raise
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else error  # without text that libraries add
-        raise ReportError(f"{targets[0]}: cannot be written ({reason}); free space, or give --out another path") from error
+        raise ReportError(f"{targets[0]}: cannot be written ({reason}); give --out another path") from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         with suppress(OSError):  # a folder that is not empty stays, and so do its parents
