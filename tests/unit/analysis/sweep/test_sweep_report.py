@@ -254,7 +254,7 @@ def test_numbers_are_at_their_value_on_an_axis_with_a_full_name() -> None:
     figure = drawn(plan("seed", "sensors.gps.position_m.noise=0,1,4", runs=15), "true_rms")
     axes = figure.axes[0]
     assert axes.get_xlabel() == "GPS position noise (m)"
-    assert has_terms(axes.get_ylabel().replace("\n", " "), "RMS", "$x_c$", "truth", "m")
+    assert has_terms(axes.get_ylabel().replace("\n", " "), "RMS", "true", "$x_c$", "m")
     assert axes.get_xticks().tolist() == [0.0, 1.0, 4.0]
     low, high = axes.get_xlim()
     assert low < 0 < 4 < high < 5
