@@ -85,6 +85,10 @@ class RadioLinks(Message, frozen=True):
     reception: tuple[tuple[Number, ...], ...] = ()
 
 
+FURTHER_COUNTED = " (further ones are counted only)"
+"""The end of the last event of many equal refusals, in records of all versions."""
+
+
 @on("world/event", writers="world", readers="each")
 class Event(Message, frozen=True):
     """An event: kind (one of EVENT_KINDS), source, subject, text and data."""

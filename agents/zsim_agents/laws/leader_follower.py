@@ -30,4 +30,4 @@ class LeaderFollower(ShapePilot):
         if self._informed:
             return self.tied(now)
         followed = consensus(self.relative(now), self.parameters.gain_1_s)
-        return followed + (self.own_reference(now)[1] if self.parameters.feedforward else np.zeros(2))
+        return followed + (self.own_place(now)[1] if self.parameters.feedforward else np.zeros(2))

@@ -81,9 +81,9 @@ class Pose(NamedTuple):
     turn: Array  # (2, 2) s R(psi)
     turn_rate: Array  # (2, 2) its derivative [1/s]
 
-    def offset(self, c: Array) -> tuple[Array, Array]:
+    def place(self, c: Array) -> tuple[Array, Array]:
         """Return the offset of a position c (2,) of the formation from the centre [m; W], and its rate [m/s]."""
-        return transformed(self.turn, c), transformed(self.turn_rate, c)
+        return turned(self.turn, c), turned(self.turn_rate, c)
 
 
 class Sight(NamedTuple):
@@ -333,7 +333,7 @@ def polygon(count: int, radius_m: float) -> Array:
 # Vector functions, with the same order of operations on every processor
 
 
-def transformed(matrix: Array, c: Array) -> Array:
+def turned(matrix: Array, c: Array) -> Array:
     """Return a matrix (2, 2) times c (2,), with the same order of operations on every processor."""
     return np.array([matrix[0, 0] * c[0] + matrix[0, 1] * c[1], matrix[1, 0] * c[0] + matrix[1, 1] * c[1]])
 
@@ -374,7 +374,7 @@ def added(terms: Sequence[Array], size: int = 2) -> Array:
     return sum(terms, np.zeros(size))
 
 
-def limited(v: Array, length_max: float) -> Array:
-    """Return v, scaled to length `length_max` if it is longer."""
+def limited(v: Array, most: float) -> Array:
+    """Return v, scaled to length `most` if it is longer."""
     size = length(v)
-    return v * (length_max / size) if size > length_max else v
+    return v * (most / size) if size > most else v

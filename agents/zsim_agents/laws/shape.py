@@ -49,7 +49,7 @@ class ShapePilot(Pilot):
     def begin(self, scenario: Scenario) -> None:
         parameters, names = self.parameters, [drone.name for drone in scenario.drones]
         positions = np.array(parameters.places_m) if parameters.places_m else polygon(len(names), parameters.radius_m)
-        self._positions: dict[str, Array] = dict(zip(names, positions, strict=True))
+        self._places: dict[str, Array] = dict(zip(names, positions, strict=True))
         self._informed = self._drone in (names[:1] if parameters.informed is None else parameters.informed)
 
     @staticmethod
@@ -58,17 +58,17 @@ class ShapePilot(Pilot):
 
     def relative(self, now: Sight) -> list[tuple[Array, Array]]:
         """Return z_ij = p_j - p_i [m; W] of each neighbour, and its desired value."""
-        own = now.reference.offset(self._positions[self._drone])[0]
-        return [(each.p_W - now.p_W, now.reference.offset(self._positions[each.name])[0] - own) for each in now.heard]
+        own = now.reference.place(self._places[self._drone])[0]
+        return [(each.p_W - now.p_W, now.reference.place(self._places[each.name])[0] - own) for each in now.heard]
 
-    def own_reference(self, now: Sight) -> tuple[Array, Array]:
+    def own_place(self, now: Sight) -> tuple[Array, Array]:
         """Return the drone's reference position p_i* [m; W] and its rate v_i* [m/s]."""
-        c, c_dot = now.reference.offset(self._positions[self._drone])
+        c, c_dot = now.reference.place(self._places[self._drone])
         return now.reference.p_W + c, now.reference.v_W + c_dot
 
     def tied(self, now: Sight) -> Array:
         """Return the terms (2,) that tie the shape to the reference [m/s; W]."""
-        p_W, v_W = self.own_reference(now)
+        p_W, v_W = self.own_place(now)
         feedforward = v_W if self.parameters.feedforward or self._informed else np.zeros(2)
         return feedforward + self.parameters.pin_1_s * (p_W - now.p_W) if self._informed else feedforward
 

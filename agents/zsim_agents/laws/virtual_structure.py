@@ -19,4 +19,4 @@ def virtual_structure(p: Array, reference: Array, rate: Array, k: float) -> Arra
 
 class VirtualStructure(ShapePilot):
     def velocity(self, now: Sight) -> Array:
-        return virtual_structure(now.p_W, *self.own_reference(now), self.parameters.gain_1_s)
+        return virtual_structure(now.p_W, *self.own_place(now), self.parameters.gain_1_s)

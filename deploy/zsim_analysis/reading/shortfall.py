@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from zsim.contract.run_messages import INCIDENTS, Event
+from zsim.contract.run_messages import FURTHER_COUNTED, INCIDENTS, Event
 from zsim.errors import NotTrustedError
 from zsim.record import Completeness
 from zsim.record.completeness import SECOND_NS
@@ -204,7 +204,7 @@ def _refusal_before(event: Event, flight: RecordedFlight) -> str:
     commands = f"drone/{event.subject}/cmd/"
     for each in reversed(flight.events):
         if each.kind == "refused" and each.subject.startswith(commands) and each.t_ns <= event.t_ns:
-            is_near = event.t_ns - each.t_ns < REFUSED_NS or each.text.endswith("counted only)")
+            is_near = event.t_ns - each.t_ns < REFUSED_NS or each.text.endswith(FURTHER_COUNTED)
             return f"refused: {each.data.get('reason', '')}" if is_near else ""
     return ""
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 from zsim.contract import keys, run_messages
+from zsim.contract.run_messages import FURTHER_COUNTED
 from zsim.contract.snapshot import PART, Saved
 from zsim.runtime.rate_limit import SUBJECTS_MAX, RateLimit
 from zsim.scenario.roles import WORLD
@@ -130,7 +131,7 @@ class RefusalLog:
         by_reason[pattern] = former + 1
         if former >= EVENTS_MAX or not self._total.spend(""):
             return None
-        last = " (further ones are only counted)" if former == EVENTS_MAX - 1 else ""
+        last = FURTHER_COUNTED if former == EVENTS_MAX - 1 else ""
         return f"{subject}: {reason}{last}"
 
 

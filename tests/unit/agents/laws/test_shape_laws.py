@@ -156,7 +156,7 @@ def test_a_moving_virtual_structure_is_joined_at_the_rate_k() -> None:
     p, errors = np.array([3.0, -2.0]), []
     for step in range(4000):
         pose = reference.at(step * h)
-        place, rate = pose.offset(c)
+        place, rate = pose.place(c)
         errors.append(float(np.linalg.norm(p - pose.p_W - place)))
         p = p + h * virtual_structure(p, pose.p_W + place, pose.v_W + rate, k)
     assert -np.log(errors[-1] / errors[0]) / (3999 * h) == pytest.approx(k, rel=2e-3)

@@ -197,7 +197,7 @@ def refusals() -> RefusalLog:
 def test_the_first_refusals_of_a_source_are_events_and_all_are_counted(refusals: RefusalLog):
     texts = [refusals.add("a.one", MODE, "too late") for _ in range(EVENTS_MAX + 5)]
     assert texts[0] == f"{MODE}: too late"
-    assert has_terms(texts[EVENTS_MAX - 1] or "", MODE, "too late", "counted")
+    assert (texts[EVENTS_MAX - 1] or "").endswith("counted only)")  # as reports look for it
     assert texts[EVENTS_MAX:] == [None] * 5
     assert refusals.add("b.two", MODE, "too late") == texts[0]
     assert refusals.count == EVENTS_MAX + 6
