@@ -10,6 +10,7 @@ import signal
 import sys
 from typing import Any
 
+import hypothesis
 import pytest
 from xdist.scheduler import LoadGroupScheduling
 
@@ -18,6 +19,10 @@ from zsim_deploy.roles.stop_channel import lower_priority
 
 PURE = ("tests/authority/", "tests/contract/", "tests/unit/")
 LEAST = 3  # number of workers from which on one is quiet
+
+# By default an example fails after 200 ms, which the first one takes on a slow machine for its imports alone.
+hypothesis.settings.register_profile("zsim", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
+hypothesis.settings.load_profile("zsim")
 
 # A shell makes background jobs ignore SIGINT, which every program that a test starts would inherit.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
