@@ -27,6 +27,7 @@ DAYS = 30.0  # validity of a certificate
 PROBE_S = 2.0  # timeout of each step of the handshake; a running listener answers within milliseconds
 LATE_S = 1.0  # in TLS 1.3 a server checks the client's certificate after the client has finished
 NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME, openssl/x509_vfy.h
+ENCRYPTED = ("tls", "quic")  # protocols in Zenoh's wheel with certificates
 NETWORKED = ("tcp", "udp", "ws")  # unencrypted protocols in Zenoh's wheel that leave the machine
 REMEDY = "make new certificates with zsim certs init"
 RENEW = f"{REMEDY} --renew"
@@ -58,7 +59,7 @@ class Identity(NamedTuple):
 
 
 def is_tls(endpoint: str) -> bool:
-    return endpoint.startswith(("tls/", "quic/"))
+    return endpoint.partition("/")[0] in ENCRYPTED
 
 
 def leaves_machine(endpoint: str) -> bool:

@@ -33,7 +33,7 @@ _CLOSE_AFTER = "transport/link/tx/queue/congestion_control/block/wait_before_clo
 _TLS = "transport/link/tls"
 ACCESS = "access_control"
 # In Zenoh's wheel; a client that connects with another one would wait for ever, since Zenoh reports only a timeout.
-PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws", "unixsock-stream")
+PROTOCOLS = (*tls.NETWORKED, *tls.ENCRYPTED, "unixsock-stream")
 
 SESSION_FILES = 32  # open files of a process with a session; 22 measured, the rest for files read while it loads
 CLIENT_FILES = 3  # open files of a hub for each process that connects; 2.2 measured, more while many connect at once

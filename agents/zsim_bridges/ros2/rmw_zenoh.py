@@ -381,7 +381,7 @@ def encode(message: Any, name: str) -> bytes:
     try:
         return bytes(_store.serialize_cdr(message, _rosbags_name(name), little_endian=True))
     except Exception as error:  # the generated writer may raise any exception for invalid values
-        raise ValueError(f"is not a {name}: {error}") from error
+        raise ValueError(f"the message is not a valid {name}: {error}") from error
 
 
 def decode(payload: bytes, name: str) -> Any:
