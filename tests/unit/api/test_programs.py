@@ -18,7 +18,7 @@ STUBBORN = """
 import signal, time
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
 print("ready", flush=True)
-time.sleep(60.0)
+time.sleep(600.0)
 """
 
 
@@ -32,7 +32,7 @@ def test_a_program_that_ignores_sigterm_is_killed_outside_linux_too() -> None:
         assert keeper.stdout.readline() == b"ready\n"
         keeper.stdin.close()
         try:
-            assert keeper.wait(20.0) == 128 + signal.SIGKILL
+            assert keeper.wait(120.0) == 128 + signal.SIGKILL
         finally:
             keeper.kill()
             keeper.stdout.close()
