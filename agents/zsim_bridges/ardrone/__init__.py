@@ -1,1 +1,1 @@
-"""The AR.Drone 2.0's protocol in both directions: presents a run's drones as AR.Drones, and a real one to a run."""
+"""The AR.Drone 2.0 protocol, both ways: a run's drones presented as AR.Drones, and a real one linked to a run."""

@@ -1,7 +1,7 @@
-"""One drone of a run presented as an AR.Drone 2.0: messages and datagrams in, commands and datagrams out. Pure.
+"""One drone of a run presented as an AR.Drone 2.0: messages and datagrams in, commands and datagrams out. No I/O.
 
-`Aircraft` stands between the run and pilots' programs, and holds the aircraft's configuration, watchdogs and state.
-`Pilot` carries out the programs' REF and PCMD: it requests a mode until this is entered or abandoned, and repeats a
+`Aircraft` connects the run to pilots' programs, and keeps the aircraft's configuration, watchdogs and state.
+`Pilot` carries out the programs' REF and PCMD: it requests a mode until it is entered or abandoned, and repeats a
 setpoint while it is in force; `SetpointSender` converts setpoints for the drone. Source: AR.Drone Developer Guide SDK
 2.0, 6.6; datagrams of existing clients.
 """
@@ -52,7 +52,7 @@ MODE_RETRY_NS = 500_000_000  # period at which a pending mode is requested again
 MODE_REQUESTS_MAX = 3  # number of requests after which a mode not entered is abandoned; design choice: 1.5 s in all
 SETPOINTS_PER_GATE_MAX = 3  # maximum number of setpoints sent within a gate: the world takes only one per gate
 IN_THE_AIR = ("taking_off", *AIRBORNE)
-NO_ALTITUDE_LIMIT_MM = 100_000  # value of altitude_max that stands for no limit (ARDroneLib)
+NO_ALTITUDE_LIMIT_MM = 100_000  # value of altitude_max that means no limit (ARDroneLib)
 CLIMB_1_S = 1.5  # maximum climb rate per metre below the maximum height [1/s], as in zsim's firmware
 CALIBRATION_YAW_RAD_S = 1.0  # yaw rate of a calibration: a full turn takes 6 s, as on the real aircraft
 ANIMATIONS_REFUSED = "flight animations are not simulated; on a real aircraft the firmware performs them"
@@ -140,7 +140,7 @@ class Aircraft:
             self.pilot.land()
 
     def _silence_ns(self) -> int:
-        """Return the time [ns] since the last AT command (0 before one), less one gate, the resolution of arrivals."""
+        """Return the time [ns] since the last AT command, less one gate, the resolution; 0 before the first command."""
         return 0 if self._command_ns is None else max(0, self._now_ns - self._command_ns - self._gate_ns)
 
     # Pilots' programs
@@ -375,7 +375,7 @@ class Pilot:
             self._calibration_end_ns = self._now_ns + self._setpoints.turn_ns
 
     def on_lost(self) -> None:
-        """Hover in place, since the pilot's program is silent; its next REF counts as its first."""
+        """Hover in place, since the pilot's program is silent; treat its next REF as its first."""
         self._last_take_off_bit = self._last_emergency_bit = False
         if self._is_own_flight():
             self._calibration_end_ns = None
@@ -436,7 +436,7 @@ class Pilot:
             self._sender.send_mode(self._now_ns, mode)
 
     def _follow(self, setpoint: TiltSetpoint) -> None:
-        """Set the setpoint, which is due at once if it differs from the last one, and send it if it is due."""
+        """Store a setpoint, due at once if it differs from the last one, and send it if it is due."""
         if setpoint != self.setpoint:
             self.setpoint, self._sent_ns = setpoint, None
         self._send_due()
@@ -457,7 +457,7 @@ class Pilot:
 
 
 class SetpointSender:
-    """Sends setpoints to one drone as fractions of its firmware's limits, in its own frame, and limits its height.
+    """Sends setpoints to one drone, in its body frame and as fractions of its firmware's limits; limits its height.
 
     Args:
         limits: the firmware's limits, to which the fractions sent to the drone refer.
@@ -508,7 +508,7 @@ class SetpointSender:
         self._sender.send_velocity(t_ns, (0.0, 0.0, 0.0), -self._turn_rad_s)
 
     def _max_climb_m_s(self) -> float:
-        """Return the maximum climb rate with which the drone stays below altitude_max."""
+        """Return the maximum climb rate at which the drone stays below altitude_max."""
         max_altitude_mm = self._configuration.number("control:altitude_max")
         if max_altitude_mm >= NO_ALTITUDE_LIMIT_MM:
             return math.inf

@@ -1,6 +1,6 @@
 """The session with one AR.Drone 2.0: it configures the aircraft, requests and decodes navdata, and carries out demands.
 
-Pure. Units and axes of navdata: millidegrees, millimetres, milli-g; x forward, y right, z down; psi clockwise from
+No I/O. Units and axes of navdata: millidegrees, millimetres, milli-g; x forward, y right, z down; psi clockwise from
 the heading at which the aircraft was switched on. Source: AR.Drone Developer Guide SDK 2.0, chapters 6 to 8.
 """
 
@@ -52,14 +52,14 @@ CONFIG_NS = 500_000_000  # time without an acknowledgement after which an entry 
 WATCHDOG_NS = 1_000_000_000  # period of watchdog resets: half of the aircraft's com_watchdog
 RESTART_DROP_MIN = 100  # packets; a sequence number that falls by at least this much shows a restart of the aircraft
 PERIOD_NS = 30_000_000  # maximum time between commands (Developer Guide, 6.3)
-CHANGE_INTERVAL_NS = 15_000_000  # minimum time between changed demands; design choice: below a gate (one demand each)
+CHANGE_INTERVAL_NS = 15_000_000  # minimum time between changed demands; design choice: below a gate, which brings one
 PULSE_NS = 90_000_000  # duration of an emergency pulse: three datagrams carry the bit, so two of them may be lost
-# Minimum time between emergency pulses: longer than one takes to show in navdata, since a second would undo the first
+# Minimum time between emergency pulses: longer than navdata takes to show one, since a second would undo the first
 PULSE_INTERVAL_NS = 400_000_000
 VELOCITY_1_S = 2.5  # velocity gain; tuned: 46 deg of phase margin with 0.14 s of delay and 0.14 s of tilt lag
 INTEGRAL_1_S2 = 2.0  # integral gain; tuned: as fast as that margin allows, since gusts last only a few seconds
 DRAG_1_S = 0.58  # deceleration by drag per unit of speed (tum_ardrone's model, fitted to flights)
-STEP_S_MAX = 0.1  # maximum time step of the integration; longer pauses count as this long
+STEP_S_MAX = 0.1  # maximum time step of the integration; longer pauses are clipped to it
 RESPONSE_NS = 240_000_000  # command delay and tilt lag (tum_ardrone: 0.1 s and 0.14 s)
 HOVER = Pcmd(0, 0, 0.0, 0.0, 0.0, 0.0)  # flag 0: hold the position
 STATES: dict[int, DroneState] = {
@@ -170,7 +170,7 @@ class AircraftSession(VehicleSession):
             yield AT, datagram
 
     def _setup_commands(self, now_ns: int) -> Iterator[Command]:
-        """Yield what the set-up needs next; an entry's acknowledgement is cleared before the next entry is sent."""
+        """Yield the watchdog resets and entries that are due; an acknowledgement is cleared before the next entry."""
         if self._received_ns is None:
             return
         is_acknowledged = StateBit.COMMAND_ACK in self._state_bits
@@ -228,7 +228,7 @@ class FlightCommands:
                 yield self._pcmd(now_ns, demand, pose)
 
     def _emergency_ref(self, now_ns: int, is_due: bool) -> Command:
-        """Return the next REF of an emergency pulse, started if `is_due`; the aircraft obeys its rising edge."""
+        """Return the next REF, starting an emergency pulse if `is_due`; the aircraft responds to the rising edge."""
         if is_due and now_ns - self._pulse_start_ns >= PULSE_INTERVAL_NS:
             self._pulse_start_ns = now_ns
         return at_commands.ref(0, takes_off=False, emergency=now_ns - self._pulse_start_ns < PULSE_NS)
@@ -264,7 +264,7 @@ class _Axis:
         self._references: deque[tuple[int, float]] = deque()
 
     def accel(self, now_ns: int, demanded: float, measured: float, max_m_s2: float) -> float:
-        """Return the acceleration [m/s^2] that the tilt must produce; wind is integrated only below `max_m_s2`."""
+        """Return the acceleration [m/s^2] that the tilt must produce; if below `max_m_s2`, update the wind estimate."""
         dt_s = 0.0 if self._last_ns is None else min(STEP_S_MAX, (now_ns - self._last_ns) * 1e-9)
         if self._last_ns is None:
             self._reference = measured
@@ -376,5 +376,5 @@ class NavdataReadings(AircraftReadings):
 
 
 def _frd_to_flu(v: Any) -> Vector:
-    """Convert a body vector from axes forward, right, down to B."""
+    """Convert a body vector from forward-right-down axes to B."""
     return float(v[0]), -float(v[1]), -float(v[2])

@@ -32,14 +32,14 @@ from zsim_bridges.vehicle_links.server import PictureServer, Say
 AUTHENTICATION_PORT = 5552  # UDP, on which programs look for drones (ARDroneLib, config.h)
 AUTH_REQUEST, AUTH_REPLY = b"PARROT AUTH", b"PARROT AUTH OK"  # ARDroneLib, ardrone_auth.c
 BACKLOG_MAX = 500_000  # unsent bytes, a few seconds of video, beyond which a connection skips to the next IDR frame
-NOT_PERMITTED = (errno.EACCES, errno.EPERM)  # errors of opening a port below 1024 without the privilege to do so
+NOT_PERMITTED = (errno.EACCES, errno.EPERM)  # errors on opening a port below 1024 without the privilege to do so
 CONNECTIONS_MAX = 8  # maximum simultaneous connections per port; design choice: a pilot's program needs only one
 LINE_MAX = 512  # maximum length of a line [bytes]
 CONNECTION_ERRORS = (OSError, EOFError, TimeoutError, ValueError)  # broken or idle connection, or overlong line
 Address = tuple[str, int]
 Refuse = Callable[[str], None]
 Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
-VERSION_PORT, FILES_PORT = 5551, 21  # TCP ports for FTP: of the version, and of videos (ARDroneLib, config.h)
+VERSION_PORT, FILES_PORT = 5551, 21  # TCP ports of the FTP servers: version file, videos (ARDroneLib, config.h)
 VERSION_FILES = {"version.txt": b"2.4.8\r\n"}  # the newest firmware of an AR.Drone 2.0
 DATA_TIMEOUT_S = 10.0  # maximum wall time that a data connection waits for its command, or a command for its transfer
 IDLE_TIMEOUT_S = 300.0  # wall time without a command after which a connection is closed
@@ -63,7 +63,7 @@ class ArdroneOptions(NamedTuple):
     Attributes:
         addresses: the text that `drone_addresses` reads.
         peers: hosts that are obeyed on addresses other than loopback.
-        rate: rate to request for the run [× real time]; None to leave it.
+        rate: rate to request for the run [× real time]; None to leave it unchanged.
     """
 
     addresses: str
@@ -207,7 +207,7 @@ class VideoServer:
     def __init__(self, peers: "AllowedHosts", refuse: Refuse) -> None:
         self._refuse = refuse
         self.port = StreamPort(peers, self._serve, refuse)
-        self._in_sync: set[asyncio.StreamWriter] = set()  # those sent an IDR frame and all frames since
+        self._in_sync: set[asyncio.StreamWriter] = set()  # connections that were sent an IDR frame and all since
         self._next_image: CameraImage | None = None
         self._stream_task: asyncio.Task[None] | None = None
         self._encoder: VideoEncoder | None = None
@@ -349,7 +349,7 @@ def _reply(writer: asyncio.StreamWriter, text: str) -> None:
 
 
 class DatagramPort(asyncio.DatagramProtocol):
-    """A UDP port: `on_datagram` is called with each datagram from a peer and its source address; others are refused."""
+    """A UDP port: passes datagrams from peers to `on_datagram`, with their source addresses; refuses all others."""
 
     def __init__(self, peers: "AllowedHosts", on_datagram: Callable[[bytes, Address], None], refuse: Refuse) -> None:
         self._peers = peers
@@ -383,7 +383,7 @@ class DatagramPort(asyncio.DatagramProtocol):
 
 
 class StreamPort:
-    """A TCP port: `serve` handles one connection of a peer until it ends; `writers` are those of all connections."""
+    """A TCP port: `serve` handles one connection of a peer until it ends; `writers` belong to open connections."""
 
     def __init__(self, peers: "AllowedHosts", serve: Serve, refuse: Refuse) -> None:
         self._peers = peers

@@ -79,7 +79,7 @@ class FlatTrim(NamedTuple):
 
 
 class Calibrate(NamedTuple):
-    """Calibrate a device: 0, the magnetometer."""
+    """Calibrate a device; 0 is the magnetometer."""
 
     sequence: int
     device: int
@@ -292,7 +292,7 @@ class ConfigurationEntry(NamedTuple):
 
 LIMITS = ("euler_angle_max", "control_vz_max", "control_yaw")
 """Limits of tilt [rad], climb rate [mm/s] and yaw rate [rad/s]; the aircraft keeps an indoor and an outdoor set."""
-_ALTITUDE = "20|100000"  # mm; the maximum stands for no limit (ARDroneLib)
+_ALTITUDE = "20|100000"  # mm; the maximum means no limit (ARDroneLib)
 _TILT, _CLIMB, _YAW = "0|0.52", "200|2000", "0.7|6.11"  # ranges in rad, mm/s and rad/s (Developer Guide 8.6)
 _CODE = "0|255"  # codecs, modes and channels, each as one byte
 _MASK = "0|4294967295"
@@ -397,7 +397,7 @@ for _name, _kind, _category, _default, *_range in (line.split("|") for line in _
 
 
 class ConfigurationError(ValueError):
-    """An entry may not be set in this way; the message states why."""
+    """An entry cannot be set to a value; the message states why."""
 
 
 class Configuration:

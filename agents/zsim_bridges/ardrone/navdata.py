@@ -3,10 +3,10 @@
 A packet consists of a header (magic, state bits, sequence number, vision flag; uint32 each), options, and finally the
 checksum option, the sum of all bytes before it. An option begins with its tag and its size in bytes, both uint16; the
 size includes these four bytes. Everything is little-endian and packed. The table has the format described in
-`wire_table`; angles are in millidegrees where a name says so: theta nose up, phi right side down, psi clockwise, 0
-where the aircraft was switched on. The body axes are x forward, y right, z down.
+`wire_table`. Angles, in millidegrees where a name says so: theta nose up, phi right side down, psi clockwise from the
+heading at switch-on. The body axes are x forward, y right, z down.
 
-The packets come first, then `NavdataSender`, which schedules them, and `NavdataContent`, which fills them. Pure.
+The packets come first, then `NavdataSender`, which schedules them, and `NavdataContent`, which fills them. No I/O.
 Source: AR.Drone Developer Guide SDK 2.0, chapter 7; ARDroneLib (SDK 2.0.1), navdata_common.h and config.h; for the GPS
 option of firmware 2.4 and later, ARDroneLib's branch `gps`.
 """
@@ -117,7 +117,7 @@ _TABLE = f"""
 
 
 class OptionLayout(WireLayout):
-    """The layout of an option; `size` [bytes] includes the header, `make` builds a NamedTuple of the fields."""
+    """The layout of an option; `size` [bytes] includes the header; `make` builds a NamedTuple of the fields."""
 
     def __init__(self, entry: Entry) -> None:
         super().__init__(entry.fields)
@@ -273,7 +273,7 @@ class NavdataTemplate:
 
 
 class NavdataSender:
-    """Sends an aircraft's navdata: decides when packets are due, which options they have, and who receives them.
+    """Sends an aircraft's navdata: decides when packets are due, which options they contain, and who receives them.
 
     Args:
         state_bits: returns the state word without the bits of the navdata mode.

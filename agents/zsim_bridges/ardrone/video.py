@@ -1,4 +1,4 @@
-"""The live video of a drone: a camera's images as H.264 frames preceded by PaVE headers. Pure.
+"""The live video of a drone: a camera's images as H.264 frames preceded by PaVE headers. No I/O.
 
 PaVE is Parrot's video encapsulation, on TCP port 5555. Source: ARDroneLib (SDK 2.0.1), video_encapsulation.h.
 """
@@ -12,7 +12,7 @@ PORT = 5555  # TCP (ARDroneLib, config.h)
 SIGNATURE = b"PaVE"
 VERSION = 2
 CODEC_H264 = 4
-HEADER_SIZE = 64  # bytes; later firmware appends four without a meaning
+HEADER_SIZE = 64  # bytes; later firmware appends four bytes without meaning
 # Displayed size; the coded height is a whole number of macroblocks
 WIDTH_PX, HEIGHT_PX, CODED_HEIGHT_PX = 640, 360, 368
 RATE_HZ = 30  # frames per second, for the encoder's rate control
@@ -87,7 +87,7 @@ class VideoEncoder:
         self._count = 0
 
     def encode(self, jpeg: bytes, force_idr: bool) -> VideoFrame | None:
-        """Return the frame of a JPEG image, None if the encoder returns no data; `force_idr`: decoding can begin at it.
+        """Return the frame of a JPEG image, an IDR frame if `force_idr`; None if the encoder returns no data.
 
         Raises:
             VideoError: the data are not a readable JPEG.
@@ -115,7 +115,7 @@ class VideoEncoder:
 
 
 def nal_units(data: bytes) -> Iterator[tuple[int, int]]:
-    """Yield the type and the size of each NAL unit, including its start code (ITU-T H.264, annex B)."""
+    """Yield the type of each NAL unit, and its size including its start code (ITU-T H.264, annex B)."""
     starts = []
     position = data.find(b"\0\0\1")
     while position >= 0:

@@ -22,7 +22,7 @@ from zsim.sensors.camera import CAMERAS, PictureError, frame_of
 from zsim.sensors.camera_model import Lens, pixel, undistorted
 from zsim.transport.session import RawSample, Session
 
-REQUEST_EXPIRY_S = 15.0  # wall; a page silent for longer counts as asleep; slow pages take seconds to show a picture
+REQUEST_EXPIRY_S = 15.0  # wall; age at which a page's request expires; slow pages take seconds to show a picture
 MESSAGE_BYTES = 1_000  # maximum size of a picture's message without the image data
 SIGHTINGS_KEPT = 8  # number of sightings kept per camera and key: half a second at 15 Hz
 MARKS_MAX = 40  # maximum number of marks on a picture; more would hide it
@@ -128,7 +128,7 @@ class CameraFeed:
         return tuple((camera, infos[camera]) for camera in self._order if camera in infos)
 
     def request_pictures(self, page: object, cameras: Iterable[str]) -> None:
-        """Request pictures of these cameras, and no others, for a page; to be repeated within REQUEST_EXPIRY_S."""
+        """Request pictures of these cameras, and no others, for a page; must be repeated within REQUEST_EXPIRY_S."""
         with self._lock:
             self._requests[page] = tuple(cameras), self._wall_s() + REQUEST_EXPIRY_S
 
@@ -252,7 +252,7 @@ def check_picture(data: bytes, width: int, height: int) -> None:
     """Refuse data that is not a complete JPEG of the given size [px], or that a page could not show.
 
     Raises:
-        PictureError: what is wrong, in one line.
+        PictureError: the data is refused; the message states why, in one line.
     """
     if len(data) > PICTURE_BYTES_MAX:
         raise PictureError(f"picture has {len(data)} bytes; must have {PICTURE_BYTES_MAX} at most")

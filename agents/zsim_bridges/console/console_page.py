@@ -397,7 +397,7 @@ class DroneForm:
         self._rename()
 
     def refresh(self, run: RunCondition) -> None:
-        """Disable the buttons whose commands would be refused for each of the drones."""
+        """Disable the buttons whose commands would be refused for all of the drones."""
         self._run = run
         refusals = [offered_refusals(run, partial(drone_refusals, drone=drone)) for drone in self.targets]
         for drone, each in zip(self.targets, refusals, strict=True):

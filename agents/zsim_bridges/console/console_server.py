@@ -57,9 +57,9 @@ REFUSAL_S = 2.0  # wall time; minimum between two refusals shown on a page: a dr
 NOTICE_S = 8.0  # wall time; how long a notification stays in the corner
 EVENTS_MAX = 20  # maximum number of events in `state`
 SILENT = "silent"  # replaces the clock's state while the world does not answer
-FEW_DRONES = 20  # with this number of drones or more, the picture rate is halved
+FEW_DRONES = 20  # with this number of drones or more, RATE_LOW_HZ applies
 RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
-FAST_RATE = 4.0  # × real time; from this rate on, the picture rate is halved too: the run needs the processors
+FAST_RATE = 4.0  # × real time; for a run at this rate or more, RATE_LOW_HZ applies too: the run needs the processors
 
 
 class Console:

@@ -70,7 +70,7 @@ class DroneRow(NamedTuple):
 
     @property
     def link_badness(self) -> float:
-        """How bad an external drone's link, or another's lag, is: 1 at the alarm threshold, infinite without a link."""
+        """Badness of an external drone's link, or of another's lag: 1 at the alarm threshold, infinite if lost."""
         drone = self.drone
         if not drone.is_external:
             return (drone.lag_ms or 0.0) / LAG_MAX_MS

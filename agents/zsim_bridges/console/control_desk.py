@@ -1,8 +1,8 @@
 """Decides which page of the console is in control of which part of the run: a formation, or the run itself.
 
 A page takes control of a free part by using one of its controls. Another page must request the part, and gets it when
-the controlling page grants the request, releases the part, is closed or is lost. Emergencies, landings and holds need
-no control.
+the controlling page grants the request, releases the part, is closed or is lost. Emergency stops, landings and holds
+need no control.
 """
 
 import threading
@@ -19,7 +19,7 @@ from zsim_bridges.console.run_forms import assign
 
 RUN = "run"  # the part with time, faults and single drones; a formation of that name shares it
 ALL_PARTS = ""  # the part of controls that affect all parts
-LOST_S = 10.0  # wall; a page that has not polled for so long counts as lost: its script or its machine has stopped
+LOST_S = 10.0  # wall; a page that has not polled for so long is considered lost: its script or its machine has stopped
 SILENT_SHOWN_S = 3.0  # wall; minimum silence that is shown; pages poll twice a second
 LOCAL_ADDRESSES = ("", "127.0.0.1", "::1")  # addresses of pages on the console's machine
 OPERATOR, VIEWER = "operator", "viewer"
@@ -28,7 +28,7 @@ CONTROL_STYLE = "font-size:12px;line-height:1.35;padding:2px 10px 6px;overflow-w
 
 
 class Holding(NamedTuple):
-    """The page that controls a part and the one that requests it (each empty for none), as seen by one page."""
+    """The page that controls a part and the one that requests it (empty if there is none), as seen by one page."""
 
     part: str
     holder: str = ""

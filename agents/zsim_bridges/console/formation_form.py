@@ -42,7 +42,7 @@ STILL_S = 2.0  # wall; if a formation's goal has not changed for this long, a mo
 MOVE_DURATION_MAX_S = 3600.0  # simulated; maximum duration of a move that controllers accept
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Rejoin": "rejoin", "Land": "land"}
 SAFE = ("hold", "land")  # operations that need no control
-RETURN = "Return"  # the formation flies above the middle of its drones' starts, and lands there
+RETURN = "Return"  # the formation flies to above the middle of its drones' starts, and lands there
 LABELS = {
     **{op: label for label, op in OPERATIONS.items()},
     "target": "sliders",
@@ -184,7 +184,7 @@ class FormationForm:
         moved = {name: value for name, slider in self._sliders.items() if (value := slider.pop_value()) is not None}
         if self.request_target(moved):
             for name in moved:
-                self._sliders[name].hold(wall_s)  # after a while, a slider with a mere preview shows the goal
+                self._sliders[name].hold(wall_s)  # after a while, a slider that was only previewed shows the goal
 
     def request_target(self, shown: dict[str, float]) -> bool:
         """Request values in the units of the page; return whether they and the duration are within their ranges."""
@@ -331,7 +331,7 @@ class VariableSlider:
         self._held = _HeldValue(float(self._slider.value), float("nan"), wall_s)
 
     def follow(self, goal: float, wall_s: float) -> None:
-        """Show the formation's goal [m, rad], unless the slider's value is still to be sent, or being flown to.
+        """Show the formation's goal [m, rad], unless the slider's value is yet to be sent or reached.
 
         The slider extends to the value that it shows; requests remain limited to the range.
         """
@@ -510,7 +510,7 @@ def waypoints_from(value: Sequence[float], ranges: Sequence[SliderRange]) -> str
 
 
 def differs_by_step(value: Sequence[float], other: Sequence[float], ranges: Sequence[SliderRange]) -> bool:
-    """Return whether the prefilled waypoints at two states of a formation differ by more than a step.
+    """Return whether the prefilled waypoints for two states of a formation differ by more than a step.
 
     If smaller differences counted, the text would change with every estimate.
     """

@@ -1,7 +1,7 @@
 """The recent past of a run, in memory: trails of its drones, and points of variables, with the plots that show them.
 
-In a flight, both cover a few minutes, and restart when time goes back. In a replay, they hold what was read of the
-record, in any order, as long as it is near the shown time.
+In a flight, both cover a few minutes, and restart when time goes back. In a replay, they contain what has been read
+from the record near the shown time, in whatever order it was read.
 """
 
 import math
@@ -45,7 +45,7 @@ BLANK = (np.array([0.0, 1.0]), *(np.full(2, np.nan) for _ in SERIES))  # data of
 NONE = "none"
 STEPS_PER_WINDOW = 6  # number of steps in which a time axis advances by its length; plots are recreated at each step
 CURVE_POINTS_MIN = 2  # minimum number of points of a curve that is drawn
-VALUE_RANGE_MIN = 0.01  # minimum range of values from which the steps of an axis are derived, in their unit
+VALUE_RANGE_MIN = 0.01  # minimum range of values from which the steps of an axis are derived, in the values' unit
 WINDOWS_S = (SPAN_S, 60.0, 20.0)  # selectable lengths of plots, simulated
 FLIGHT_UNITS = {
     "x": "m",
@@ -378,7 +378,8 @@ class AxisRange(NamedTuple):
     def of_values(cls, values: Sequence[Array], always: bool = False) -> "AxisRange | None":
         """Return the range of curves (M,) in one unit, NaN where unknown; None if uPlot can derive it.
 
-        uPlot cannot derive it if a curve is entirely unknown. `always`: return it whenever any value is known.
+        uPlot cannot derive it if a curve is entirely unknown. `always`: return it even if uPlot can derive it. If no
+        value is known, return None.
         """
         known = np.concatenate(values)
         known = known[np.isfinite(known)]

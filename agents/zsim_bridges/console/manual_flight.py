@@ -2,7 +2,7 @@
 
 A page acquires a drone, commands it at a steady rate, and releases it. The drone hovers as soon as motion is no longer
 requested: when the stick is released, or the page is silent, hidden or gone. A return flies a drone to a point above
-its start, or a formation, through its controller, above the middle of its drones' starts; there they land. A later
+its start, or a formation, through its controller, to above the middle of its drones' starts, and lands it. A later
 request ends a return. Positions and velocities are in W, unless the suffix of a name says otherwise.
 """
 
@@ -32,7 +32,7 @@ from zsim_bridges.console.picture import PLAN_DIGITS, plan_formations, plan_posi
 from zsim_bridges.console.run_monitor import RunMonitor
 from zsim_bridges.console.scene import RunScene
 
-PERIOD_S = 0.05  # wall; period of commands: at 5 × real time, two in the 0.5 s simulated after which firmware hovers
+PERIOD_S = 0.05  # wall; period of commands: at 5 × real time, two within the firmware's limit of silence (0.5 s)
 STALE_S = 0.5  # wall; the drone of a page that is silent for longer hovers; equal to the firmware's limit of silence
 PAGE_TIMEOUT_S = 5.0  # wall; time after which the drone of a lost page is released, unless the page has been reloaded
 REPEAT_S = 1.0  # wall; time after which an unanswered request for a drone is repeated
@@ -46,7 +46,7 @@ WAYPOINTS_MAX = 50  # maximum number per drone; design choice: more would no lon
 BRAKE_S = 1.0  # time constant of braking before the fence; design choice: three times the lag of the velocity loop
 ABOVE_START_M = 0.5  # horizontal distance from its start at which a drone lands; design choice: the size of a hull
 OVER_STARTS_M = 0.5  # distance from the middle of its drones' starts at which a formation lands
-OVERRULED_M = 1.0  # a returning formation counts as sent elsewhere when its goal recedes by more than this
+OVERRULED_M = 1.0  # a returning formation is considered sent elsewhere when its goal recedes by more than this
 CENTRE_VARIABLES = ("x_c", "y_c")  # the variables of a formation that a return sets
 Point = tuple[float, float]  # x, y [m; W]
 
@@ -111,7 +111,7 @@ class FlightAnswer(NamedTuple):
 
 
 class Geofence(NamedTuple):
-    """A box around the drones' starts, by its corners [m; W]."""
+    """A box around the drones' starts, given by two corners [m; W]."""
 
     low_m: Vector
     high_m: Vector
@@ -456,7 +456,7 @@ class PageFlying:
     """Flies single drones for the pages of one run; pages are identified by viser's number.
 
     `on_return_over` is called with each drone or formation whose return ends without a landing, and the reason, unless
-    a formation's return was refused or followed by another request from the console.
+    a formation's return was refused or followed by another request from the console, or the formation has no view.
     """
 
     def __init__(
@@ -566,7 +566,7 @@ class ReturnFlights:
         self._formations: dict[str, _ReturningFormation] = {}
 
     def request_drones(self, drones: Sequence[str]) -> None:
-        """Take over each drone, fly it above its start at its present height, and land it there."""
+        """Take over each drone, fly it to above its start at its present height, and land it there."""
         for drone in drones:
             answer = self._control.take(ReturningDrone(drone), drone, take_over=True)
             if answer.state == "none":
@@ -576,7 +576,7 @@ class ReturnFlights:
                 self._drones.add(drone)
 
     def request_formation(self, cluster: str) -> None:
-        """Move a formation, in its present shape, above the middle of its drones' starts, and land it there."""
+        """Move a formation, in its present shape, to above the middle of its drones' starts, and land it there."""
         values = dict(zip(CENTRE_VARIABLES, self.centres[cluster], strict=True))
         self._client.request_cluster(cluster, "target", values=values)
         with self._lock:

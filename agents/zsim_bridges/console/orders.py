@@ -1,8 +1,8 @@
 """Requests of operators: sent in threads of their own, and tracked until they have taken effect.
 
-`CommandClient` sends requests and modes, and reports the outcome of each. Orders must not be lost: `OrderBook` sends
+`CommandClient` sends requests and modes, and reports the outcome of each. Orders must not be lost: `OrderBook` resends
 each until it is carried out, refused or replaced. The page chooses the id of an order, and repeats the order until it
-is settled; the console carries out each id once, and repeats an order that has not been confirmed: the answer may be
+is settled; the console creates one order per id, and resends an order that has not been confirmed: the answer may be
 missing, a radio may have lost the command, or its stamp may have become too old while a process stalled. Other
 requests are sent once; `PendingRequests` reports when an accepted one is done.
 """
@@ -208,7 +208,7 @@ class CommandClient:
         return self._modes[drone]
 
     def take(self, drone: str, on_done: Callable[[str], None]) -> None:
-        """Acquire a drone with an operator's priority; `on_done` receives the reason for a refusal, or an empty one."""
+        """Acquire a drone with an operator's priority; `on_done` receives why it was refused, empty if it was not."""
         with suppress(RuntimeError):  # closed; the run has ended
             self._requests.submit(lambda: on_done(_refusal_of(self._acquire, drone, PRIORITY)))
 
@@ -218,7 +218,7 @@ class CommandClient:
             self._releases.submit(_refusal_of, self._request, keys.CONTROL, "release", {"drone": drone})
 
     def send_velocity(self, drone: str, velocity_m_s: tuple[float, float, float], yaw_rate_rad_s: float) -> None:
-        """Command a velocity to an acquired drone, in its heading frame."""
+        """Send an acquired drone a velocity command in its heading frame."""
         key, v = keys.command(drone, "velocity"), velocity_m_s
         with suppress(ZsimError):  # the link is lost: the world lets the drone hover
             message = flight_messages.Velocity(self._now_ns(), self._next_seq(key), self._name, v, yaw_rate_rad_s)
@@ -356,7 +356,7 @@ class DroneQueue:
 
 
 class OrderRequest(Struct, frozen=True, forbid_unknown_fields=True):
-    """An order from a page, which repeats it with the same id until it is confirmed or refused."""
+    """An order from a page, which repeats it with the same id until it is settled."""
 
     op: Literal["emergency", "land", "hold", "acknowledge"]
     id: Name = ""
@@ -492,10 +492,10 @@ class OrderBook:
                         self._settle(order, target, "refused", target.reason)
 
     def update(self, states: Mapping[str, str], t_ns: int, *, paused: bool) -> None:
-        """Settle orders that have taken effect, were replaced or can no longer be flown; repeat the others.
+        """Settle orders that have taken effect, were replaced or can no longer be carried out; repeat the others.
 
         `states` has the states of drones and the phases of formations at `t_ns`. A command that is accepted while the
-        run is paused takes effect when it continues, and is not repeated before.
+        run is paused takes effect when the run resumes, and is not repeated before.
         """
         with self._lock:
             self._paused = paused
@@ -504,7 +504,7 @@ class OrderBook:
                 for name, target in order.targets.items():
                     if target.state != "sent":
                         continue
-                    # A formation's controller answers requests: its phase counts only after one had no answer.
+                    # A formation's controller answers requests: its phase matters only after one went unanswered.
                     has_effect = states.get(name) in _CARRIED_OUT[order.op] and (target.is_drone or target.attempts > 1)
                     must_wait = target.is_in_progress or silent or (paused and target.accepted)
                     if ended:
@@ -550,9 +550,9 @@ class OrderBook:
         return order
 
     def _replace_earlier(self, order: _Order) -> None:
-        """Replace earlier orders for the same targets, but an emergency only by another.
+        """Replace earlier orders for the same targets; an emergency is replaced only by another emergency.
 
-        An emergency also replaces the orders of formations that it stops.
+        An emergency also replaces the orders for formations all of whose drones it stops.
         """
         target_names = set(order.targets)
         if order.op == "emergency":

@@ -22,7 +22,7 @@ from zsim_bridges.console.picture import Array, DronePoses
 
 OFFSET_M = np.array([-2.3, -3.9, 1.7])  # offset of a page's camera from its target, unless it must be farther away
 DISTANCE_MIN_M = float(np.linalg.norm(OFFSET_M))
-SLOPE_MIN = 0.05  # half the visible width per distance on the narrowest page considered; a hidden page has no width
+SLOPE_MIN = 0.05  # half the visible width per unit of distance on the narrowest page considered; hidden pages have none
 REACH_M = 0.6  # radius of a drone together with the name above it
 VISIBLE_MAX_M = 15.0  # distance beyond which a drone is too small, less than about 15 pixels, to count as in view
 MARGIN = 0.85  # share of half the page within which points count as in view

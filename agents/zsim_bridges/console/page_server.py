@@ -1,4 +1,4 @@
-"""The console's HTTP server: serves the page to permitted clients, and relays between the page and a private viser.
+"""The console's HTTP server: serves pages to permitted clients, and relays messages between pages and a private viser.
 
 The page is viser's, extended by the parts in `frame/`: a head, tools over the scene, and camera windows. Viewers see
 its controls disabled. The page can also show the files that the run has written, and copy them before the console
@@ -68,7 +68,7 @@ CLIENT_HEADER = "X-Zsim-Client"  # key of a page, which maps to viser's number
 COPIED_HEADER = "X-Zsim-Copied"  # sent once a page has its copies from a console that is exiting
 SECRET_HEADER = "X-Zsim-Console"  # its value, a secret, is required by viser's server
 ALL_ADDRESSES = ("0.0.0.0", "::")
-PAGES_MAX = 50  # maximum number open at once, separately for each role: viewers must not exclude operators
+PAGES_MAX = 50  # maximum number of open pages, separately for each role: viewers must not exclude operators
 HEARTBEAT_S = 20.0  # period of pings, which detect a page whose machine has disappeared
 CLOSE_S = 0.3  # wall; timeout used twice on exit: for requests in progress, and for pages to close their sockets
 POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'none'; form-action 'none'"
@@ -90,9 +90,9 @@ PARTS = (  # files added to viser's page; each may use what those before it defi
     "map_view.html",
     "touch.html",
 )
-# wall; without a poll for this long a page counts as closed; above GONE_MS of head_bar.html + LOOK_MS of orders.html
+# wall; a page silent for this long is considered closed; above GONE_MS of head_bar.html + LOOK_MS of orders.html
 POLL_TIMEOUT_S = 5.0
-MTIME_ERROR_S = 2.0  # maximum amount by which a file's time may be too early: the resolution of FAT
+MTIME_ERROR_S = 2.0  # maximum amount by which a file's modification time may be too early: the resolution of FAT
 POLL_S = 0.1  # wall; period of checking whether all pages have their copies
 POLLING_PAGES_MAX = 200  # maximum number of pages remembered; at most 50 of operators and 50 of viewers are open
 _ORDERS = msgspec.json.Decoder(OrderRequest)
@@ -146,7 +146,7 @@ class RunFiles:
         return {"files": files, "leaves": self._is_exiting}
 
     def offer(self, within_s: float, is_abandoned: Callable[[], bool]) -> None:
-        """Tell pages to copy the files before the console exits; wait `within_s` at most, and not if `is_abandoned`."""
+        """Tell pages to copy the files before the console exits; wait at most `within_s`, or until `is_abandoned`."""
         self._is_exiting = True
         deadline_s = time.monotonic() + within_s
         while (now_s := time.monotonic()) < deadline_s and not is_abandoned():
@@ -395,7 +395,7 @@ class PageTokens:
         self._port = port
 
     def cookie(self, role: str) -> str:
-        """Return the name of a role's cookie; it has the port, since browsers share cookies between a host's ports."""
+        """Return the name of a role's cookie; it includes the port, since a host's ports share cookies in browsers."""
         return f"zsim_{role}_{self._port}"
 
     def role_of(self, request: PageRequest) -> str | None:
@@ -469,7 +469,7 @@ class PrivateViser:
         return self.server.get_port()
 
     def close(self) -> None:
-        """Stop the server, without the text that viser prints."""
+        """Stop the server, suppressing the text that viser prints."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 

@@ -70,7 +70,7 @@ class PlayRecord(_Action, frozen=True, tag="play"):
 
     op: Literal["seek", "pause", "resume", "step", "rate"]
     value: Annotated[float, Meta(ge=0.0, le=1e9)] = 1.0
-    """Simulated seconds to seek, gates to step, or simulated seconds per wall second."""
+    """The simulated time to seek [s], the number of gates to step, or the rate [× real time]; otherwise unused."""
 
 
 class TakeDrone(_Action, frozen=True, tag="take"):
@@ -122,7 +122,7 @@ _ACTIONS = msgspec.json.Decoder(_ViewAction | _OperatorAction)
 class ActionSockets:
     """The action sockets of all pages.
 
-    `record` returns the control of a replay, and `flying` that of single drones; None without a run.
+    `record` returns the player of a run's record, and `flying` the control of its single drones; None without a run.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ class ActionSockets:
             flying.control.lose(page)
 
     def act(self, text: str, role: str, page: Any = None) -> dict[str, Any] | None:
-        """Carry out an action (JSON) from a page in a role; return the answer, None for a forbidden or invalid one.
+        """Carry out a page's action (JSON) in a role; return the answer, None if the action is invalid or forbidden.
 
         `page`, its socket, identifies the page that flies a drone.
         """
@@ -230,7 +230,7 @@ _PICTURES = msgspec.json.Decoder(PicturesRequest)
 
 
 class PageBatches:
-    """The messages with pictures for one page: each has all changes of the requested cameras since the last message.
+    """The messages with pictures for one page: each contains all changes of the requested cameras since the last one.
 
     A message is the length of its header (4 bytes, big-endian), the header as JSON, and the JPEGs in succession.
     The header has `cameras` (name, width, height; null if unchanged), `pictures` (camera, size [bytes; 0: unchanged],

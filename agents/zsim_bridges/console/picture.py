@@ -1,4 +1,4 @@
-"""What pages draw of a run, as arrays: poses, ellipsoids, formations, and previews of their flight. Pure.
+"""What pages draw of a run, as arrays: poses, ellipsoids, formations, and previews of their flight. No I/O.
 
 Axes of W: east, north, up. Quaternions: w first, body to world.
 """
@@ -23,7 +23,7 @@ from zsim_agents.references.flight import FlightError, flight_of
 
 Array = NDArray[np.float64]
 
-ROTOR_SLOWDOWN = 50.0  # the fastest rotors turn by 57 degrees from one picture to the next at 10 Hz: never backwards
+ROTOR_SLOWDOWN = 50.0  # the fastest rotors turn by 57 degrees per picture at 10 Hz, so none seems to turn backwards
 SIGMAS = 2.0  # half axes of an ellipsoid, in standard deviations
 SHARE_WITHIN = 1 - math.erfc(SIGMAS / math.sqrt(2)) - math.sqrt(2 / math.pi) * SIGMAS * math.exp(-(SIGMAS**2) / 2)
 """Share of a 3-D Gaussian within 2 sigma: the chi-squared distribution with three degrees of freedom at 4, 0.739."""
@@ -115,7 +115,7 @@ def drone_on_ray(
 
     Args:
         drones: N drones.
-        radii_m: (N,) m, radii of the spheres that count as hits; a distant sphere is enlarged to subtend CLICK_RAD.
+        radii_m: (N,) m, radii of the spheres that a ray must hit; a distant sphere is enlarged to subtend CLICK_RAD.
         origin_W, direction_W: origin and direction of the ray [m; W]; a zero direction hits nothing.
     """
     direction = np.array(direction_W)
@@ -130,7 +130,7 @@ def drone_on_ray(
 
 
 def shown_names(names: Sequence[str]) -> list[str]:
-    """Return names; of more than FULL_NAMES_MAX, omit the common prefix up to a digit, unless one would be empty."""
+    """Return names; if more than FULL_NAMES_MAX, without the common prefix before a digit, unless that empties one."""
     if len(names) <= FULL_NAMES_MAX:
         return list(names)
     common = takewhile(lambda column: len(set(column)) == 1 and not column[0].isdigit(), zip(*names, strict=False))

@@ -24,7 +24,7 @@ from zsim_bridges.console.run_condition import (
 )
 
 REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 10px 10px;overflow-wrap:anywhere"
-"""The bottom padding is for the row of tabs below, which would overlap the end of the text by 9 px."""
+"""The bottom padding makes room for the row of tabs below, which would overlap the end of the text by 9 px."""
 LIMITS_STYLE = "font-size:11px;line-height:1.2;color:#868e96;padding:0 12px 4px;text-align:right"
 HELD_HINT = "hold for 0.6 s, with the pointer, Space or Enter"  # equal to HOLD_MS in orders.html
 DURATION_MAX_S = 1e5  # maximum duration of a fault; longer than any run
@@ -262,7 +262,7 @@ def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
 
 
 class OrderButton:
-    """A button for an order, which its page repeats until it is confirmed or refused; HTML, not a control of viser.
+    """A button for an order, which the page repeats until it is settled; HTML, not a control of viser.
 
     Args:
         target: target of the order: {"drone": name}, with several names separated by commas, or {"cluster": name}.

@@ -1,6 +1,6 @@
-"""The state of a run, derived from its views and clock: condition, alarms, flight, effects of faults; its record.
+"""The state of a run, derived from its views and clock: condition, alarms, flight, effects of faults.
 
-`RunMonitor` derives the condition, `TimeMonitor` polls the clock, and `RecordPlayer` plays a record.
+`RunMonitor` derives the condition, `TimeMonitor` polls the clock, and `RecordPlayer` plays the record of a replay.
 """
 
 import math
@@ -43,7 +43,7 @@ FAULTS_KEPT = 8  # maximum number of past faults that are still shown
 SIGMA_GROWN = 1.2  # minimum ratio to the initial sigma that is shown; smaller changes occur without a fault
 LAG_GROWN_MS = 40.0  # minimum increase in lag that is shown: two gates
 PROCESS_STATES = ("alive", "dead")  # states of a process
-RESTART_STATE_COUNT = 3  # number of states: alive, dead, alive
+RESTART_STATE_COUNT = 3  # number of states of a restarted process: alive, dead, alive
 WIND_GROWN_M_S = 0.3  # minimum increase in wind that is shown; design choice: above the rounding of the display
 BATTERY_S = 20.0  # simulated; how long a battery must have been observed before its remaining time is shown
 BATTERY_POINTS_MAX = 120
@@ -53,7 +53,7 @@ ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
 BEAT_S = 0.1  # wall; period of this process's heartbeat
 BEAT_MAX_S = 0.5  # wall; at most this much time counts between two beats: a busy machine delays a thread by less
 STALL_S = 2.0  # wall; a longer time without a beat is a stall
-SILENT_S = 1.7  # wall; after this long without an answer the world counts as silent: a stop is shown within 2 s
+SILENT_S = 1.7  # wall; after this long without an answer the world is considered silent: a stop is shown within 2 s
 PIECE_S = 10.0  # simulated; span read in one request, which blocks a replay of thirty drones for 0.15 s
 INSTANT_DRONES_MAX = 9_000  # maximum number of drone views in a piece; a replay returns fewer than 10 000
 READ_BEFORE_S, READ_AFTER_S = (
@@ -231,7 +231,7 @@ class FlightMeter:
 
 
 class FaultWatch:
-    """Tracks what has changed at the targets of injected faults since these began. Pure."""
+    """Tracks what has changed at the targets of injected faults since the faults began."""
 
     def __init__(self) -> None:
         self._watched: dict[int, _WatchedFault] = {}
@@ -422,7 +422,7 @@ class TimeMonitor:
                     self.clock, self._clock_read_s, self._answered_s = clock, start_s, self._awake.now_s()
 
     def now_ns(self) -> int:
-        """Return simulated time for a stamp, after a poll, of ANSWER_TIMEOUT_S at most, if it may be too old."""
+        """Return simulated time for a stamp; if it may be too old, poll first, for ANSWER_TIMEOUT_S at most."""
 
         def is_old() -> bool:
             rate = max(1.0, self.clock.rate) if self.clock else 1.0  # the measured rate is 0 at the beginning of a run

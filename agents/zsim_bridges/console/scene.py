@@ -276,7 +276,7 @@ class SceneNodes:
             self._scene.add_line_segments("/references", lines.astype(np.float32), GHOST, **style)
 
     def on_click(self, act: Callable[[viser.SceneClickEvent], None]) -> None:
-        """Register a callback for viser's event of each click in the scene.
+        """Register a callback for each click in the scene.
 
         It is not registered on the drones' nodes: a page of viser 1.1.1 fails to open if a batched mesh is clickable.
         """

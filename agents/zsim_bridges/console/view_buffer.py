@@ -109,7 +109,7 @@ class ViewBuffer:
         self.faults: tuple[Fault, ...] = ()  # injected faults, planned and active
         self.log = EventLog(observer.name)
         self.losses = Losses()
-        self.failsafes: dict[str, Event] = {}  # by drone: last automatic landing or any stop, until another mode
+        self.failsafes: dict[str, Event] = {}  # by drone: last automatic landing or emergency, until another mode
         self.recent_faults: deque[Fault] = deque(maxlen=FAULTS_KEPT)  # the most recently begun faults
         self.end = ""  # why the run ended, according to its last event; empty while it continues
         self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that the console causes
@@ -289,7 +289,7 @@ def commanded_drone(event: Event) -> str:
 
 
 class EventRow(NamedTuple):
-    """The newest of events that differ only in the numbers in their texts, and how many there were."""
+    """The newest of the events that differ only in the numbers in their texts, and how many there were."""
 
     event: Event
     times: int

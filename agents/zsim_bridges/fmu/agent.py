@@ -46,7 +46,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 
 
 class Fmu:
-    """Factory of an FMU agent: `zsim.run("step.yaml", agents=[zsim.Fmu("controller.fmu", "drone1", {...})])`.
+    """Factory for an FMU agent: `zsim.run("step.yaml", agents=[zsim.Fmu("controller.fmu", "drone1", {...})])`.
 
     Args:
         path: path of the FMU, which must be for co-simulation with FMI 2 or 3.
@@ -208,7 +208,7 @@ class FmuAgent(Agent):
         return Output(key, Mode(t_ns, self.next_seq(key), self.source, mode))
 
     def motion_commands(self, t_ns: int, formation: Formation, c_dot: Sequence[float]) -> list[Output]:
-        """Return velocity commands for cluster rates c_dot (4n,), to the formation's drones that accept setpoints."""
+        """Return velocity commands that yield cluster rates c_dot (4n,), for the drones that accept setpoints."""
         outputs = []
         for drone, command in zip(formation.drones, formation.velocities(self._latest, c_dot), strict=False):
             if self.accepts_setpoints(drone):

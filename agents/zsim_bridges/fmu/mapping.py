@@ -321,7 +321,7 @@ def _conversion(variable: Variable, place: Place, is_output: bool) -> tuple[Call
 class Formation:
     """A formation's kinematics: cluster variables from estimates, and velocities from rates of these variables.
 
-    An FMU can thus be a cluster space controller without kinematics of its own: c in, c_dot out.
+    An FMU can thus be a cluster-space controller without kinematics of its own: c in, c_dot out.
 
     Attributes:
         drones: names of the drones, in the order of the cluster's robots.

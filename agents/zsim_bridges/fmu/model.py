@@ -295,7 +295,7 @@ class FmuInstance:
 
 
 class FmuLog:
-    """Receives an FMU's log: passes warnings and errors, or all lines, to `say`, and keeps the last of the former."""
+    """Receives an FMU's log: passes warnings and errors, or all lines, to `say`; keeps the last warnings and errors."""
 
     def __init__(self, name: str, say: Callable[[str], None], all_lines: bool) -> None:
         self._name, self._say, self._all = name, say, all_lines

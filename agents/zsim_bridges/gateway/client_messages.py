@@ -24,7 +24,7 @@ COUNTED_KEYS = (
     keys.command("*", "*"),
     keys.estimate("*"),
     keys.cluster_state("*"),
-)  # keys whose messages count in the field `sent` of a done
+)  # keys whose messages are counted in the field `sent` of a `done`
 CAMERA_KEYS = (keys.camera("*", "*"), keys.camera_info("*", "*"), keys.detections("*"))
 """Keys of clients' own cameras, renderers and detectors."""
 CLIENT_KEYS = (*COUNTED_KEYS, keys.cluster_view("*"), keys.estimates_view("*"), *CAMERA_KEYS)
@@ -104,7 +104,7 @@ class ClientLimit:
 
 
 def is_counted_key(key: str) -> bool:
-    """Return whether a done counts the messages on a key."""
+    """Return whether the messages on a key are counted in a `done`."""
     return _matches_any(COUNTED_KEYS, key)
 
 

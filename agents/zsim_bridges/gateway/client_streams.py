@@ -24,8 +24,8 @@ FLUSH_S = 2.0  # time limit for sending the remaining lines once a connection en
 LINES_PER_TURN = 100  # consecutive lines of one client after which other tasks of the loop may run
 LINE_MAX = 1_000_000  # size limit of a request [bytes]
 HEARTBEAT_S = 20.0  # wall; period of the pings that detect a WebSocket whose client is gone
-KEEPALIVE_S = 10.0  # wall; silence after which a stream sends a sign of life, to detect a client that is gone
-LINGER_S = 10.0  # wall; how long a camera's subscription outlives its last client: some request single pictures
+KEEPALIVE_S = 10.0  # wall; silence after which a stream sends a keepalive, to detect a client that is gone
+LINGER_S = 10.0  # wall; how long a camera's subscription outlives its last client: some clients request single pictures
 BOUNDARY = "zsim-picture"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "Access-Control-Allow-Origin": "*"}
 _SOCKET_OPTIONS = (
@@ -115,7 +115,7 @@ async def run_duplex(
         reading: ends with the client's last request.
         sending: ends when nothing remains to be sent.
         finish: ends the client, so that sending ends.
-        abort: ends the connection at once if the client does not receive the rest.
+        abort: ends the connection at once if the client does not receive the rest in time.
     """
     reader, sender = asyncio.create_task(reading), asyncio.create_task(sending)
     try:
@@ -189,7 +189,7 @@ async def _read_lines(client: StreamHandler, reader: asyncio.StreamReader) -> No
 
 
 async def serve_websocket(request: web.Request, new_client: ClientFactory) -> web.WebSocketResponse:
-    """Serve a WebSocket until it ends: each message is a line. Its request has already been authenticated."""
+    """Serve a WebSocket until it ends: each message is a line. The request has already been authenticated."""
     websocket = web.WebSocketResponse(max_msg_size=LINE_MAX, heartbeat=HEARTBEAT_S)
     await websocket.prepare(request)
     abort = _abort_of(request)
@@ -225,7 +225,7 @@ async def stream_events(
     expression: str,
     event_of: Callable[[RawSample], bytes],
 ) -> web.StreamResponse:
-    """Send every publication on an expression, as `event_of` formats it, until the client leaves; skip empty events.
+    """Send every publication on an expression, as `event_of` formats it, until the client is gone; skip empty events.
 
     For errors see `SharedSubscriptions.subscribe_stream`.
     """
@@ -341,7 +341,7 @@ class PictureFeeds:
 
 
 async def stream_pictures(request: web.Request, feed: PictureFeed) -> web.StreamResponse:
-    """Send pictures as multipart/x-mixed-replace, as fast as the client reads, until it leaves."""
+    """Send pictures as multipart/x-mixed-replace, as fast as the client reads, until it is gone."""
     kind = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
     response = web.StreamResponse(headers={**PICTURE_HEADERS, "Content-Type": kind})
     try:

@@ -166,7 +166,7 @@ class Gateway:
         """Count a client as authenticated.
 
         Raises:
-            TooManyError: the limit of clients is reached, or this client has been evicted meanwhile.
+            TooManyError: there are too many clients, or this client has been evicted meanwhile.
         """
         if client not in self._unauthenticated:
             raise TooManyError("the connection was closed, since it waited too long for its token; connect again")
@@ -323,7 +323,7 @@ class Gateway:
 
 
 def _release_drones(link: Session, commanded: Iterable[tuple[str, str]]) -> None:
-    """Release drones in the name of the source that commanded each; the world knows whether it still commands them."""
+    """Request releases in the name of the source that commanded each drone; the world checks that it still does."""
     with suppress(ZsimError):
         for source, drone in commanded:
             link.request(keys.CONTROL, "release", source, {"drone": drone}, RELEASE_TIMEOUT_S)
@@ -450,7 +450,7 @@ class Client:
         task.add_done_callback(self._pending.discard)
 
     async def _send_answer(self, request: client_messages.AskRequest, run: RunAccess) -> None:
-        """Wait for an answer while other requests are executed, since it may depend on the client's next done."""
+        """Wait for an answer while other requests are executed, since it may depend on the client's next `done`."""
         try:
             answer = await run.request(request.key, request.request, request.args, self.source, request.timeout_s)
         except ZsimError as error:
@@ -535,7 +535,7 @@ class Client:
             self.send({"op": "run", "state": state, "run_id": run_id})
 
     def close(self, connection_lost: bool = True) -> None:
-        """Release everything that the client holds; in the lockstep, a lost connection counts as a dead process."""
+        """Release the client's resources; in the lockstep, a lost connection is treated as a dead process."""
         if self._closed:
             return
         self._closed = True

@@ -1,1 +1,1 @@
-"""The HTML added to viser's page: the head, the tools over the scene, and the windows of the drones' cameras."""
+"""The HTML added to viser's page: the head, the tools overlaid on the scene, and the windows of the drones' cameras."""
