@@ -186,7 +186,7 @@ class VehicleServer(ABC):
         self.say_once(reason)
 
     def say_once(self, text: str) -> None:
-        """Print a text once; texts that differ only in numbers count as equal."""
+        """Print a text once; texts that differ only in numbers are treated as equal."""
         reason = without_numbers(text)
         if reason not in self._reported and len(self._reported) < REPORTED_MAX:
             self._reported.add(reason)
