@@ -210,7 +210,7 @@ def error_response(status: int, text: str, allowed: Iterable[str] = ()) -> web.R
 
 
 def _is_from_this_machine(request: web.Request) -> bool:
-    """Return whether a request comes from a program on this machine and not, by its origin, from another server's page.
+    """Return whether a request is from a program on this machine and, by its origin, not from another server's page.
 
     A server on another port of this machine is another server, so its pages are not trusted. The Host header must be
     checked too, since another site can make its own name resolve to this machine.
@@ -377,7 +377,7 @@ def _first_accepted(request: web.Request) -> str:
 def sample_to_json(sample: RawSample) -> dict[str, Any]:
     """Return an answer or a publication in the plugin's JSON format."""
     kind, payload = sample.encoding.partition(";")[0], sample.payload
-    value: Any = base64.b64encode(payload).decode() if payload else None  # unless it is JSON or text by its encoding
+    value: Any = base64.b64encode(payload).decode() if payload else None  # unless its encoding is JSON or text
     try:
         if payload and kind in JSON:
             value = json.loads(payload)

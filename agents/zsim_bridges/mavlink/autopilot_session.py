@@ -54,7 +54,7 @@ REPEAT_NS = 1_000_000_000  # period of repeated commands; ample, since an autopi
 KILL_REPEAT_NS = 200_000_000  # shorter than REPEAT_NS, since this is the one command that must not be lost
 SETPOINT_NS = 40_000_000  # 25 Hz; PX4 treats setpoints at less than 2 Hz as lost
 CHANGE_INTERVAL_NS = 15_000_000  # minimum spacing of changed setpoints; shorter than a gate, which brings one setpoint
-STREAM_DURATION_NS = 600_000_000  # PX4 requires more than 0.5 s of setpoints before OFFBOARD
+STREAM_DURATION_NS = 600_000_000  # of setpoints before OFFBOARD, for which PX4 requires a stream of more than 2 Hz
 VELOCITY_AND_YAW_RATE = 0xFFF & ~(TypeMask.VX | TypeMask.VY | TypeMask.VZ | TypeMask.FORCE | TypeMask.YAW_RATE)
 # First six parameters of NAV_LAND and NAV_TAKEOFF: no position given
 NO_POSITION = (0.0, 0.0, 0.0, math.nan, math.nan, math.nan)
@@ -316,7 +316,7 @@ class AutopilotState:
         return self.custom_mode == self.control.custom_mode
 
     def command(self, number: int, *parameters: float) -> dialect.CommandLong:
-        """Return a command to the vehicle; `parameters` are its first ones, and the others are 0."""
+        """Return a command to the vehicle; `parameters` are its first ones, and the rest are 0."""
         return dialect.CommandLong(*self.address, number, 0, *parameters)
 
     def state(self, is_flying: bool, has_climbed: bool) -> DroneState:

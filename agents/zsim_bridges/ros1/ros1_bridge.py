@@ -222,7 +222,7 @@ class TiltCommand(NamedTuple):
 
 
 class DriverCommands:
-    """Passes commands from ROS nodes to one drone, by the driver's rules.
+    """Passes commands from ROS nodes to one drone, following the driver's rules.
 
     Like the driver, it repeats the last cmd_vel until another arrives, or until the drone no longer flies.
     """

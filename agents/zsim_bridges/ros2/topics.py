@@ -51,7 +51,7 @@ ZERO = (0.0, 0.0, 0.0)
 
 
 class Topic(NamedTuple):
-    """A topic that the bridge publishes; `convert` returns the ROS message, or None if none is due."""
+    """A topic that the bridge publishes; `convert` returns the ROS message for a key's message, None if none is due."""
 
     name: str
     kind: str

@@ -1,4 +1,4 @@
-"""The driver process: presents an aircraft at the other end of a wire as one drone of a run.
+"""The driver process: presents an aircraft at the other end of a link as one drone of a run.
 
 The session with the aircraft and the failsafe, which perform no I/O, are in other modules; this one has the drone's
 messages and keys, the sockets, the event loop, and the command-line options.
@@ -311,8 +311,8 @@ class ExternalDrone:
 
     Args:
         to_simulated: converts a time of this process's clock to simulated time.
-        hover_rad_s: speed of each rotor when hovering, published in flight because no wire reports rotor speeds and
-            other drones fly in the downwash.
+        hover_rad_s: speed of each rotor when hovering, published in flight because no wire protocol reports rotor
+            speeds and other drones fly in the downwash.
 
     Attributes:
         readings: readings for the next gate, appended by the caller.

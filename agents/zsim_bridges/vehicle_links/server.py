@@ -1,4 +1,4 @@
-"""Servers that present one run's drones as aircraft on a wire; they send commands, but no gate waits for them."""
+"""Servers that present one run's drones to clients as aircraft; they send commands, but no gate waits for them."""
 
 import asyncio
 import contextlib
@@ -115,7 +115,7 @@ Say = Callable[[str], None]
 
 
 class VehicleServer(ABC):
-    """One run's drones on a wire; `options` are those of the wire, and `serve` requests the pace `options.rate`."""
+    """Serves one run's drones over a wire protocol with its own `options`; `serve` requests the pace `options.rate`."""
 
     def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: Any) -> None:
         self.link = link

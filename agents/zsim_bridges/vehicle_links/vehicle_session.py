@@ -1,4 +1,4 @@
-"""The wire-independent parts of a driver: demands on an aircraft, and the session that carries them out. No I/O.
+"""The protocol-independent parts of a driver: demands on an aircraft, and the session that carries them out. No I/O.
 
 `Failsafe` turns accepted commands into demands within limits, and makes the aircraft hold or land if commands cease.
 Its rules, with times measured at the rate of the run:
@@ -12,7 +12,7 @@ Its rules, with times measured at the rate of the run:
 - While nothing is received from the aircraft, only a landing, a stop or a reset is sent: after a power cycle, it might
   take the next setpoint or a repeated take-off for a new command.
 
-`VehicleSession` is the base class of the sessions on all wires, with the aircraft's readings and clock. Poses and
+`VehicleSession` is the base class of all protocols' sessions, with the aircraft's readings and clock. Poses and
 readings are timestamped by the clock of this process.
 """
 
@@ -330,7 +330,7 @@ class LinkQuality(NamedTuple):
 
 
 class VehicleSession(ABC):
-    """The state machine of one aircraft at the other end of a wire. No I/O: the process passes in the time.
+    """The state machine of one aircraft at the other end of a link. No I/O: the process passes in the time.
 
     Args:
         channels: the aircraft's ports; a channel number is an index into them.
@@ -451,7 +451,7 @@ class AircraftReadings:
     def gps_values(
         self, geodetic: Vector, speed_m_s: float, course_rad: float, sigma_m: float, fix: int, satellites: int
     ) -> tuple:
-        """Return the values of a fix, with its position in W; the climb rate is the pose's, since no wire carries one.
+        """Return the values of a fix, with its position in W; the climb rate is the pose's, as the protocols send none.
 
         Args:
             geodetic: latitude, longitude [deg], height [m].

@@ -29,7 +29,7 @@ ERROR_STATUS_MIN = 400  # lowest HTTP status of an error
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 ANY_PORT = 0  # lets the kernel choose
 BACKLOG = 128  # connections that the kernel queues until they are accepted; aiohttp's default
-READ_BYTES = 16_384  # buffer for a body that no handler has read yet; a connection holds twice as much
+READ_BYTES = 16_384  # buffer for a body that no handler has read yet; a connection buffers up to twice as much
 Resource = TypeVar("Resource")
 _NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests that are not HTTP are answered, but not logged
 

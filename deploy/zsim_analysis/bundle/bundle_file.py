@@ -32,7 +32,7 @@ MEMBERS_MAX = 5000
 MANIFEST_BYTES_MAX = 4 << 20
 NAME_MAX = 200  # longest name of a member [characters]
 CHUNK_BYTES = 1 << 20
-DATE = (1980, 1, 1, 0, 0, 0)  # date of every member: the earliest that a zip archive can hold
+DATE = (1980, 1, 1, 0, 0, 0)  # date of every member: the earliest that a zip archive can store
 MODE = (stat.S_IFREG | 0o644) << 16
 UNIX = 3  # stored as the creating system on every system, so that the bytes are the same
 PIN = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?==[A-Za-z0-9][A-Za-z0-9.!+_]*")  # a line of the lock file

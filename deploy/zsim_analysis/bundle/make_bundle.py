@@ -51,7 +51,7 @@ PROJECT = "zsim"
 BYTES_MAX = 50_000_000  # largest total size of users' modules, which should hold code, not data
 MODULE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 PATH = re.compile(r"(?<![\w./~-])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:;,'\"()]+[/\\])+")  # the folders of an absolute path
-FREE_TEXT = ("text", "reason", "error", "failure")  # message fields that hold free text
+FREE_TEXT = ("text", "reason", "error", "failure")  # message fields with free text
 WALL_CLOCK_FIELDS = (
     *("run_id", "date", "changed", "versions", "fingerprint", "mode", "real_time_factor", "wall_s", "command_age_ms"),
     *("deadlines", "deadline_misses", "deadline_misses_by", "links", "participants", "events", "events_left_out"),
