@@ -231,7 +231,7 @@ class KeyTrees:
     full_subscriptions: SharedSubscriptions  # subscriptions to full keys
     subscriptions: SharedSubscriptions  # subscriptions to keys without the federation's name
     feeds: PictureFeeds
-    limit: ClientLimit  # bounds the number of clients; each stream of pictures is one of them
+    limit: ClientLimit  # bounds the number of clients; each stream of pictures is one client
     source: str  # source of control requests that name none
 
     async def get_full(self, request: web.Request) -> web.StreamResponse:
@@ -444,7 +444,7 @@ def description() -> dict[str, Any]:
     return {
         "openapi": "3.1.0",
         "info": {"title": "zsim gateway", "version": __version__, "description": "See docs/gateway.md."},
-        "servers": [{"url": "."}],  # relative to this description, so that it is right behind a proxy under any path
+        "servers": [{"url": "."}],  # relative to this description, so that it is valid behind a proxy under any path
         "paths": {**paths, **_other_paths()},
         "components": {
             "schemas": {**schemas, "Refusal": refusal},

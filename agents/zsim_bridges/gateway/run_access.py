@@ -396,7 +396,7 @@ class SharedSubscriptions:
 
     Args:
         loop: event loop on which everything but Zenoh's callbacks is called.
-        limit: bounds the number of clients; a connection with a single subscription is one of them.
+        limit: bounds the number of clients; a connection with a single subscription is one client.
         waiting_max: number of an expression's messages that may wait for the loop; beyond it, the oldest are dropped.
     """
 

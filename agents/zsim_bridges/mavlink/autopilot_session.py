@@ -49,12 +49,14 @@ HEARTBEAT_NS = 1_000_000_000  # https://mavlink.io/en/services/heartbeat.html
 TIMESYNC_NS = 500_000_000  # design choice: ten round trips within the window of the clock offset
 REQUEST_NS = 3_000_000_000  # time after which a missing stream is requested again: three periods of the slowest one
 SENDERS_REPORTED_MAX = 256  # other senders reported, each only once
-CLIMBED_FRACTION = 0.85  # fraction of the take-off height at which the climb ends; allows for errors of reported ones
+CLIMBED_FRACTION = 0.85  # fraction of the take-off height at which the climb ends; reported heights are inexact
 REPEAT_NS = 1_000_000_000  # period of repeated commands; ample, since an autopilot answers within about 0.1 s
 KILL_REPEAT_NS = 200_000_000  # shorter than REPEAT_NS, since this is the one command that must not be lost
 SETPOINT_NS = 40_000_000  # 25 Hz; PX4 treats setpoints at less than 2 Hz as lost
-CHANGE_INTERVAL_NS = 15_000_000  # minimum spacing of changed setpoints; shorter than a gate, which brings one setpoint
-STREAM_DURATION_NS = 600_000_000  # of setpoints before OFFBOARD, for which PX4 requires a stream of more than 2 Hz
+CHANGE_INTERVAL_NS = (
+    15_000_000  # minimum spacing of changed setpoints; below the gate period, so that every gate's is sent
+)
+STREAM_DURATION_NS = 600_000_000  # duration of the stream before OFFBOARD, which PX4 refuses without setpoints
 VELOCITY_AND_YAW_RATE = 0xFFF & ~(TypeMask.VX | TypeMask.VY | TypeMask.VZ | TypeMask.FORCE | TypeMask.YAW_RATE)
 # First six parameters of NAV_LAND and NAV_TAKEOFF: no position given
 NO_POSITION = (0.0, 0.0, 0.0, math.nan, math.nan, math.nan)
@@ -83,7 +85,7 @@ class ExternalControl(NamedTuple):
         custom_mode: the mode, as in heartbeats; parameters: those of DO_SET_MODE for it, from the second on.
         takes_off: whether the vehicle takes off in this mode, rather than in a separate one.
         own: further modes in which this driver remains in control, and from which it may return to `custom_mode`.
-        landing: mode in which the vehicle lands, whether this driver, the pilot or its own failsafe has demanded it.
+        landing: mode in which the vehicle lands, whether demanded by this driver, by the pilot, or by its own failsafe.
         rates_hz: requested rates, by telemetry message.
     """
 

@@ -184,7 +184,7 @@ class Mission:
     # Steps
 
     def takeoff_height_m(self, state: VehicleState) -> float | None:
-        """Return the height z in W at which the current item's take-off ends; None if it is not a take-off."""
+        """Return the height z in W at which the current item's take-off ends; None if the item is another one."""
         item = self._item
         return position_of(item, state)[2] if item and item.command == Cmd.NAV_TAKEOFF else None
 

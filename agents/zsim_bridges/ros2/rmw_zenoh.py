@@ -134,7 +134,7 @@ def gid_of(token: str) -> bytes:
 
 
 class Attachment(NamedTuple):
-    """The attachment of a message, request or reply: sequence number from 1, wall time [ns], sender (client) gid."""
+    """An attachment: sequence number (from 1), wall time [ns], and gid of the sender or, in a reply, of the client."""
 
     sequence: int
     wall_ns: int

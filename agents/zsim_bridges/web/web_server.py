@@ -179,7 +179,7 @@ class HttpConnections:
     async def _receive(
         self, request: web.Request, connection: "HttpConnection", since_s: float | None, reservations: AsyncExitStack
     ) -> None:
-        """Receive the body of a request before the handler runs; `reservations` keep its room until that has finished.
+        """Receive the body of a request before the handler runs; `reservations` keep its room until the handler ends.
 
         Raises aiohttp's errors for a body that is too long or did not arrive in time, for instance for lack of room.
         """
