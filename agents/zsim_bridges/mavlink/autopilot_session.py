@@ -53,9 +53,7 @@ CLIMBED_FRACTION = 0.85  # fraction of the take-off height at which the climb en
 REPEAT_NS = 1_000_000_000  # period of repeated commands; ample, since an autopilot answers within about 0.1 s
 KILL_REPEAT_NS = 200_000_000  # shorter than REPEAT_NS, since this is the one command that must not be lost
 SETPOINT_NS = 40_000_000  # 25 Hz; PX4 treats setpoints at less than 2 Hz as lost
-CHANGE_INTERVAL_NS = (
-    15_000_000  # minimum spacing of changed setpoints; below the gate period, so that every gate's is sent
-)
+CHANGE_INTERVAL_NS = 15_000_000  # minimum spacing of changed setpoints; less than a gate, so that each gate's is sent
 STREAM_DURATION_NS = 600_000_000  # duration of the stream before OFFBOARD, which PX4 refuses without setpoints
 VELOCITY_AND_YAW_RATE = 0xFFF & ~(TypeMask.VX | TypeMask.VY | TypeMask.VZ | TypeMask.FORCE | TypeMask.YAW_RATE)
 # First six parameters of NAV_LAND and NAV_TAKEOFF: no position given
