@@ -1,7 +1,7 @@
-"""The gateway's HTTP server: access checks, and trees of keys.
+"""The gateway's HTTP server: access checks, and handlers for two trees of keys and for camera pictures.
 
-Full keys form the tree of the Zenoh REST plugin, with unchanged payloads. GET and POST query, PUT and PATCH publish,
-DELETE deletes; `Accept: text/event-stream` subscribes; `?_raw` returns the first payload alone. Source: zenoh,
+Full keys are served as by the Zenoh REST plugin, with unchanged payloads. GET and POST query, PUT and PATCH publish,
+DELETE deletes; `Accept: text/event-stream` subscribes; `?_raw` returns only the first payload. Source: zenoh,
 plugins/zenoh-plugin-rest.
 
 /json/KEY, where KEY lacks the federation's name, exchanges JSON by the schema of each message:
@@ -10,7 +10,7 @@ GET    … with Accept: text/event-stream   every value from now on
 PUT    /json/drone/drone1/cmd/velocity    {"velocity_m_s": [1, 0, 0]}; t_ns, seq and source are filled in
 POST   /json/world/control                {"op": "pause", "args": {}}
 
-/camera/DRONE/CAMERA is a stream of pictures, /camera/DRONE/CAMERA.jpg the newest one.
+/camera/DRONE/CAMERA is a stream of pictures, /camera/DRONE/CAMERA.jpg the newest one; /stream is a WebSocket.
 """
 
 import base64
@@ -69,7 +69,7 @@ METHODS = "GET, POST, PUT, PATCH, DELETE, OPTIONS"
 EVENT_STREAM = "text/event-stream"
 RAW, TOKEN = "_raw", "token"
 BYTES = "zenoh/bytes"  # the plugin's encoding for a body without Content-Type
-PICTURE_TIMEOUT_S = 2.0  # wall; time to wait for the first picture: twice the period of a slow camera
+PICTURE_TIMEOUT_S = 2.0  # wall time to wait for the first picture: twice the period of a slow camera
 NO_PICTURE = "no picture yet; is a camera process publishing there, and is time running?"
 NO_VALUE = "no value yet; is the key right, and does a process publish it?"
 STREAM, DESCRIPTION, CAMERA = "/stream", "/openapi.json", "/camera/{drone}/{camera}"
@@ -124,7 +124,7 @@ def application(access_check: "AccessCheck", trees: "KeyTrees", new_client: Clie
         return web.json_response(description())
 
     def not_allowed(*allowed: str) -> Handler:
-        """Return a handler that refuses all other methods of a path."""
+        """Return a handler for the methods of a path that are not allowed."""
 
         async def refuse(request: web.Request) -> web.StreamResponse:
             raise web.HTTPMethodNotAllowed(request.method, allowed)
@@ -169,7 +169,7 @@ class AccessCheck:
 
     @web.middleware
     async def check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse requests above the rate limit, without the token, or, if none is set, from other servers' pages."""
+        """Refuse requests above the rate limit, without the token or, if no token is set, from other servers' pages."""
         response = await self._answer(request, handler)
         if not response.prepared:
             response.headers.setdefault("Access-Control-Allow-Origin", "*")
@@ -210,7 +210,7 @@ def error_response(status: int, text: str, allowed: Iterable[str] = ()) -> web.R
 
 
 def _is_from_this_machine(request: web.Request) -> bool:
-    """Return whether a request comes from a program on this machine and not, by its origin, from another server's page.
+    """Return whether a request is from a program on this machine and, by its origin, not from another server's page.
 
     A server on another port of this machine is another server, so its pages are not trusted. The Host header must be
     checked too, since another site can make its own name resolve to this machine.
@@ -231,7 +231,7 @@ class KeyTrees:
     full_subscriptions: SharedSubscriptions  # subscriptions to full keys
     subscriptions: SharedSubscriptions  # subscriptions to keys without the federation's name
     feeds: PictureFeeds
-    limit: ClientLimit  # bounds the number of clients, including streams of pictures
+    limit: ClientLimit  # bounds the number of clients; each stream of pictures is one client
     source: str  # source of control requests that name none
 
     async def get_full(self, request: web.Request) -> web.StreamResponse:
@@ -259,7 +259,7 @@ class KeyTrees:
         stored = [] if body else run.last_samples(expression)
         if stored and "*" not in expression:
             return stored
-        # The query string may hold the gateway's token besides Zenoh's parameters.
+        # The query string may contain the gateway's token besides Zenoh's parameters.
         parts = [part for part in request.query_string.split("&") if part.partition("=")[0] not in (TOKEN, "")]
         answers = await run.query(expression, ";".join(parts), body, _encoding_of(request))
         stored_keys = {sample.key for sample in stored}
@@ -377,7 +377,7 @@ def _first_accepted(request: web.Request) -> str:
 def sample_to_json(sample: RawSample) -> dict[str, Any]:
     """Return an answer or a publication in the plugin's JSON format."""
     kind, payload = sample.encoding.partition(";")[0], sample.payload
-    value: Any = base64.b64encode(payload).decode() if payload else None  # unless it is JSON or text by its encoding
+    value: Any = base64.b64encode(payload).decode() if payload else None  # unless its encoding is JSON or text
     try:
         if payload and kind in JSON:
             value = json.loads(payload)
@@ -396,7 +396,7 @@ def _sample_event(sample: RawSample) -> bytes:
 
 @lru_cache(maxsize=CACHED_VALUES)
 def value_event(sample: RawSample) -> bytes:
-    """Return a publication as an event; empty for an invalid message."""
+    """Return a publication as a server-sent event; empty for an invalid message."""
     deleted = {"key": sample.key, "value": None}
     try:
         value = json_entry(sample.key, sample.payload, sample.encoding) if sample.payload else deleted
@@ -444,7 +444,7 @@ def description() -> dict[str, Any]:
     return {
         "openapi": "3.1.0",
         "info": {"title": "zsim gateway", "version": __version__, "description": "See docs/gateway.md."},
-        "servers": [{"url": "."}],  # relative to this description, so that it holds behind a proxy under any path
+        "servers": [{"url": "."}],  # relative to this description, so that it is valid behind a proxy under any path
         "paths": {**paths, **_other_paths()},
         "components": {
             "schemas": {**schemas, "Refusal": refusal},
@@ -455,7 +455,7 @@ def description() -> dict[str, Any]:
 
 
 def _without_prefix_items(schema: Any) -> Any:
-    """Return a schema with vectors as arrays of one item type, since few tools know `prefixItems`."""
+    """Return a schema with vectors as arrays of one item type, since few tools support `prefixItems`."""
     if isinstance(schema, list):
         return [_without_prefix_items(entry) for entry in schema]
     if not isinstance(schema, dict):

@@ -44,11 +44,11 @@ from zsim_bridges.gateway.client_messages import (
 
 TICK_S = 0.1  # wall; period at which health is published and a stop is noticed while nothing arrives
 REQUESTS_MAX = 64  # concurrent requests; each has a thread that waits for Zenoh
-ECHOES_MAX = 256  # number of expected echoes per key; a paused world returns none while clients may publish
+ECHOES_MAX = 256  # number of expected echoes per key; a paused world returns none, but clients may publish meanwhile
 DELETED = None
-OWN_BYTES_MAX = 64_000_000  # total size of the values on clients' own keys
+OWN_BYTES_MAX = 64_000_000  # total size of the values on clients' own keys [bytes]
 KEYS_MAX = 200_000  # number of keys with a last value; 1000 drones make about 12 000
-WAITING_MAX = 50_000  # default limit of an expression's messages that wait for the loop
+WAITING_MAX = 50_000  # by default, maximum number of an expression's messages that wait for the loop
 DELIVER_MAX = 500  # messages delivered before other tasks of the loop run
 EXPRESSIONS_MAX = 2_000  # number for all clients together; the world's session checks every subscription
 
@@ -71,7 +71,7 @@ class RunAccess:
     Attributes:
         values: last values of keys.
         defaults: defaults for messages in the gateway's own name.
-        required_processes: (process, drone or cluster served) of all processes that the run needs to start.
+        required_processes: each process that the run needs in order to start, with the drone or cluster that it serves.
     """
 
     def __init__(self, link: Session, info: Info, observer: Participant, secured: bool) -> None:
@@ -132,7 +132,7 @@ class RunAccess:
             ticker.join()
 
     def _store_valid(self, add: Callable[[str, bytes], None], sample: RawSample | ReceivedSample) -> None:
-        """Store a last value; count an invalid message, which any process may publish, but ignore it."""
+        """Store a last value; ignore, but count, an invalid message, since any process may publish one."""
         if is_valid(sample.key, sample.payload):
             add(sample.key, sample.payload)
         else:
@@ -147,7 +147,7 @@ class RunAccess:
     # By keys without the federation's name
 
     def put(self, key: str, value: Any, defaults: MessageDefaults) -> None:
-        """Publish plain data on a key, with missing fields filled in; for errors see `encode`, `check_writable`."""
+        """Publish plain data on a key, with missing fields filled in; for errors, see `encode` and `check_writable`."""
         self.check_writable(key)
         with defaults.transaction():
             payload = self.encode(key, defaults.fill(key, value, self.now_ns))
@@ -225,7 +225,7 @@ class RunAccess:
         ]
 
     async def query(self, expression: str, parameters: str, payload: bytes, encoding: str) -> list[RawSample]:
-        """Return the answers to a Zenoh get on a full expression; for errors see `request`."""
+        """Return the answers to a Zenoh get on a full expression; for errors, see `request`."""
         return await self._in_thread(self.unprefixed_link.query, expression, parameters, payload, encoding)
 
     def put_full_key(self, key: str, payload: bytes, encoding: str) -> None:
@@ -249,7 +249,7 @@ class RunAccess:
         """Return a full key without this federation's name; None for a key of no federation or of another one.
 
         Raises:
-            DecodeError, ForbiddenError, UnknownError: clients may not publish on this key, in any federation.
+            DecodeError, ForbiddenError, UnknownError, SessionError: clients may not publish on this key.
         """
         local_key = key.removeprefix(self._prefix)
         if local_key != key:
@@ -275,7 +275,7 @@ class EchoFilter:
 
     After two values in quick succession, the echo of the first arrives when the second is already stored; after a
     value and its deletion, the echo arrives when there should be no value. An echo that never arrives is forgotten
-    with the next echo on its key. Echoes are expected for at most `keys_max` keys.
+    when a later one arrives on its key. Echoes are expected for at most `keys_max` keys.
     """
 
     def __init__(self, keys_max: int) -> None:
@@ -308,7 +308,7 @@ class LastValues:
     """The last value of every key that passed through the world or was published by this gateway's clients.
 
     Args:
-        table: keys of the world's messages about the drones of the run, see `run_key_table`.
+        table: keys of the world's messages about the drones of the run; see `run_key_table`.
     """
 
     def __init__(self, table: tuple[str, ...]) -> None:
@@ -368,7 +368,7 @@ class LastValues:
         return encoding if encoding and payload == self._payloads.get(key) else messages.encoding(key)
 
     def add_gate(self, gate: GateMessages) -> None:
-        """Store the world's messages of a gate; their columns have been checked."""
+        """Store the world's messages of a gate, whose columns have already been checked."""
         for m, index in enumerate(gate.which.tolist()):
             self._gate_entries[index] = (gate, m)
 
@@ -396,7 +396,7 @@ class SharedSubscriptions:
 
     Args:
         loop: event loop on which everything but Zenoh's callbacks is called.
-        limit: bounds the number of clients; a connection with a single subscription counts as one.
+        limit: bounds the number of clients; a connection with a single subscription is one client.
         waiting_max: number of an expression's messages that may wait for the loop; beyond it, the oldest are dropped.
     """
 
@@ -424,7 +424,7 @@ class SharedSubscriptions:
 
         Raises:
             SessionError: the expression is invalid, or the gateway's certificate does not permit reading it.
-            TooManyError: there are EXPRESSIONS_MAX other expressions already.
+            TooManyError: there are already EXPRESSIONS_MAX other expressions.
         """
         shared = self._by_expression.get(expression)
         if shared is None:
@@ -511,7 +511,7 @@ class LockstepSession(Agent):
 
     Attributes:
         connection_lost: whether the client disconnected without leaving, or did not answer in time, so that its process
-            counts as dead.
+            is considered dead.
 
     Raises:
         DecodeError: the period or a gate key is invalid.
@@ -589,7 +589,7 @@ class LockstepSession(Agent):
             raise DecodeError("done: there is no gate to answer; wait for the next")
         if request.t_ns != self._gate_ns:
             raise DecodeError(f"done: t_ns is {request.t_ns}; must be {self._gate_ns}, the last gate sent")
-        counted: list[Output] = []  # those that a done counts: the runner publishes these, the gateway the others
+        counted: list[Output] = []  # counted in `done` messages: the runner publishes these, the gateway the others
         others: list[tuple[str, bytes]] = []
         with self.defaults.transaction():
             for key, value in ((output.key, output.value) for output in request.outputs):

@@ -48,13 +48,13 @@ SYSTEM, COMPONENT = 245, 191  # ids of this driver; the component is MAV_COMP_ID
 HEARTBEAT_NS = 1_000_000_000  # https://mavlink.io/en/services/heartbeat.html
 TIMESYNC_NS = 500_000_000  # design choice: ten round trips within the window of the clock offset
 REQUEST_NS = 3_000_000_000  # time after which a missing stream is requested again: three periods of the slowest one
-SENDERS_REPORTED_MAX = 256  # other systems reported, each only once
-CLIMBED_FRACTION = 0.85  # fraction of the take-off height that counts as reached; allows for errors of the reports
+SENDERS_REPORTED_MAX = 256  # other senders reported, each only once
+CLIMBED_FRACTION = 0.85  # fraction of the take-off height at which the climb ends; reported heights are inexact
 REPEAT_NS = 1_000_000_000  # period of repeated commands; ample, since an autopilot answers within about 0.1 s
 KILL_REPEAT_NS = 200_000_000  # shorter than REPEAT_NS, since this is the one command that must not be lost
 SETPOINT_NS = 40_000_000  # 25 Hz; PX4 treats setpoints at less than 2 Hz as lost
-CHANGE_INTERVAL_NS = 15_000_000  # minimum spacing of changed setpoints; below the gate period (one setpoint each)
-STREAM_DURATION_NS = 600_000_000  # PX4 requires more than 0.5 s of setpoints before OFFBOARD
+CHANGE_INTERVAL_NS = 15_000_000  # minimum spacing of changed setpoints; less than a gate, so that each gate's is sent
+STREAM_DURATION_NS = 600_000_000  # duration of the stream before OFFBOARD, which PX4 refuses without setpoints
 VELOCITY_AND_YAW_RATE = 0xFFF & ~(TypeMask.VX | TypeMask.VY | TypeMask.VZ | TypeMask.FORCE | TypeMask.YAW_RATE)
 # First six parameters of NAV_LAND and NAV_TAKEOFF: no position given
 NO_POSITION = (0.0, 0.0, 0.0, math.nan, math.nan, math.nan)
@@ -70,10 +70,10 @@ _RATES_HZ: dict[type, float] = {
 }
 ACCEL_GYRO, MAG, PRESSURE = 0x003F, 0x01C0, 0x0200  # HIGHRES_IMU_UPDATED_FLAGS
 DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
-FLOW_NS = 66_000_000  # 15 Hz, as on the AR.Drone; period of the estimated velocities that replace a missing flow
+FLOW_NS = 66_000_000  # 15 Hz, as on the AR.Drone; period of the estimated velocities that replace missing flow readings
 FLOW_LOST_NS = 1_000_000_000  # time without flow after which the estimated velocity replaces it: 15 periods
 UT_PER_GAUSS, PA_PER_HPA = 100.0, 100.0
-DOP_M = 2.0  # position error per unit of dilution [m], usual for single-frequency receivers
+DOP_M = 2.0  # position error per unit of HDOP [m], typical of single-frequency receivers
 
 
 class ExternalControl(NamedTuple):
@@ -83,7 +83,7 @@ class ExternalControl(NamedTuple):
         custom_mode: the mode, as in heartbeats; parameters: those of DO_SET_MODE for it, from the second on.
         takes_off: whether the vehicle takes off in this mode, rather than in a separate one.
         own: further modes in which this driver remains in control, and from which it may return to `custom_mode`.
-        landing: mode in which the vehicle lands, whether for this driver, its pilot, or its own failsafe.
+        landing: mode in which the vehicle lands, whether demanded by this driver, by the pilot, or by its own failsafe.
         rates_hz: requested rates, by telemetry message.
     """
 
@@ -316,14 +316,14 @@ class AutopilotState:
         return self.custom_mode == self.control.custom_mode
 
     def command(self, number: int, *parameters: float) -> dialect.CommandLong:
-        """Return a command to the vehicle; `parameters` are its first ones, and the others are 0."""
+        """Return a command to the vehicle; `parameters` are its first ones, and the rest are 0."""
         return dialect.CommandLong(*self.address, number, 0, *parameters)
 
     def state(self, is_flying: bool, has_climbed: bool) -> DroneState:
         """Return the vehicle's state in terms of the contract.
 
         Args:
-            is_flying: whether the vehicle is following a setpoint.
+            is_flying: whether the vehicle is to follow a velocity, rather than hold its position.
             has_climbed: whether it has reached its take-off height.
         """
         if self._is_terminated:
@@ -341,7 +341,7 @@ class DemandSequence:
     """The commands and setpoints that make one autopilot carry out demands.
 
     Commands are repeated until the telemetry shows their effect, a kill as long as it is demanded; setpoints are sent
-    when they change, at most every CHANGE_INTERVAL_NS, and repeated while they do not.
+    when they change, at most once per CHANGE_INTERVAL_NS, and repeated while they do not.
     """
 
     def __init__(self, takeoff_height_m: float) -> None:
@@ -422,7 +422,7 @@ class TelemetryReadings(AircraftReadings):
             arrives, the origin of W.
 
     Attributes:
-        clock, unix_clock: clock offsets for messages timestamped since boot and since 1970.
+        clock, unix_clock: clock offsets for messages whose timestamps count from boot and from 1970.
         has_origin: whether the origin of the vehicle's local frame is known.
     """
 

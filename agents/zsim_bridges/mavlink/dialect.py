@@ -399,7 +399,7 @@ class MessageLayout(WireLayout):
         return self.codec.pack(*(values if self.is_flat else self.flat(values)))
 
     def unpack(self, payload: bytes) -> WireMessage:
-        """Return the message in a payload; missing trailing bytes count as 0, excess bytes are ignored."""
+        """Return the message in a payload; missing trailing bytes are taken as 0, excess bytes ignored."""
         if len(payload) != self.size:
             payload = payload[: self.size].ljust(self.size, b"\0")
         return self.kind(*self.nested(self.codec.unpack(payload)))
@@ -574,7 +574,7 @@ class Parser:
 
     Attributes:
         refused: number of refused frames by reason: `bad_crc`, `unknown` (not in the dialect), `incompatible` (unknown
-            flags), `truncated`, `unsigned`, `bad_signature`, `replayed`; and `noise`, the bytes outside frames.
+            incompat_flags), `truncated`, `unsigned`, `bad_signature`, `replayed`; and `noise`, bytes outside frames.
     """
 
     def __init__(self, signing: Signing | None = None) -> None:

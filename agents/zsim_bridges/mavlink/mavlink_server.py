@@ -62,10 +62,11 @@ class MavlinkOptions(NamedTuple):
     Attributes:
         level: level of the telemetry rates.
         gcs, gcs_local: address of the ground station, and the first drone's local port for it.
-        api, api_local: address of programs for the first drone, and its local port for them; later drones count up.
+        api, api_local: address of programs for the first drone, and its local port for them; later drones' ports
+            count up.
         key: signing key; None for no signatures.
         rate: pace to request from the world; None to request none.
-        first_system_id: system id of the first drone; the others count up.
+        first_system_id: system id of the first drone; those of the others count up.
     """
 
     autopilot: str
@@ -233,7 +234,7 @@ class ServedVehicle:
 
 
 class VehiclePort:
-    """One UDP port; it sends to `peer` without having heard from it.
+    """One UDP port, which sends to `peer` even before `peer` has sent anything.
 
     Raises:
         RunError: the port cannot be opened.
@@ -249,7 +250,7 @@ class VehiclePort:
             self._socket.bind(local)
         except OSError as error:
             self._socket.close()
-            is_unavailable = error.errno in (errno.EADDRINUSE, errno.EACCES)  # by a process, or by the system
+            is_unavailable = error.errno in (errno.EADDRINUSE, errno.EACCES)  # in use, or reserved by the system
             advice = (
                 "other ports with --gcs-local and --api-local"
                 if is_unavailable
@@ -288,10 +289,10 @@ class VehiclePort:
 
 
 class Peers:
-    """The peers of one port: the configured one, and programs on this machine that send to it.
+    """The peers of one port: the configured one, and programs on this machine that send to the port.
 
     Attributes:
-        refused: number of datagrams from others.
+        refused: number of datagrams from other senders.
     """
 
     def __init__(self, configured: Address) -> None:

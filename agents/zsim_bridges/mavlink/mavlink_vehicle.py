@@ -62,20 +62,20 @@ from zsim_bridges.vehicle_links.drone_link import CommandSender
 
 HEADING_FRAMES = (MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED, MavFrame.BODY_FRD)
 OFFSET_FRAMES = (MavFrame.LOCAL_OFFSET_NED, *HEADING_FRAMES)
-HOVER_THRUST = 0.5  # thrust of a setpoint, in [0, 1], that carries the weight; PX4's MPC_THR_HOVER
+HOVER_THRUST = 0.5  # thrust of a setpoint, in [0, 1], that balances the weight; PX4's MPC_THR_HOVER
 YAW_RATE_MAX_RAD_S = math.radians(60.0)  # MPC_YAWRAUTO_MAX
 SPEED_MAX_M_S = 1e3  # m/s; faster setpoints are refused, since no vehicle here flies that fast
 Setpoint = Target | TiltTarget
 TEXT_MAX = 50  # characters in a STATUSTEXT
 REFUSED_MAX = 100  # refusal reasons remembered, so that each is reported only once
-GUIDED_ITEM = 2  # value of MISSION_ITEM.current with which older ArduPilot clients send the vehicle there at once
+GUIDED_ITEM = 2  # value of MISSION_ITEM.current with which older ArduPilot clients send the vehicle to an item at once
 HEARTBEAT_NS = 1_000_000_000  # heartbeat period [ns of wall time]
 STICK_FULL_SCALE = 1000.0  # full deflection in MANUAL_CONTROL
 STICK_UNUSED = 32767
 NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
 AUTOPILOT_VERSION = dialect.LAYOUTS[dialect.AutopilotVersion].id
 HOME_POSITION = dialect.LAYOUTS[dialect.HomePosition].id
-SPEED_SETTINGS: dict[int, Setting] = {2: "up_m_s", 3: "down_m_s"}  # by SPEED_TYPE; others set the horizontal speed
+SPEED_SETTINGS: dict[int, Setting] = {2: "up_m_s", 3: "down_m_s"}  # by SPEED_TYPE; other types set the horizontal speed
 FAULT_SUFFIXES = {"fault": "", "fault_end": " is over", "fault_clear": " cleared"}
 FENCE_MODES = {
     FenceAction.HOLD: FlightMode.HOLD,
@@ -86,7 +86,7 @@ Point = tuple[float, float]
 
 
 class Options(NamedTuple):
-    """The identity of a vehicle: system id, autopilot, telemetry level, name of this process, and 64-bit unique id."""
+    """The options of a vehicle: system id, autopilot, telemetry level, name of this process, and 64-bit unique id."""
 
     system_id: int
     personality: Personality
@@ -123,7 +123,8 @@ class MavlinkVehicle:
     """One drone presented as a MAVLink vehicle.
 
     Attributes:
-        state: the drone's state, which the caller keeps up to date; monitor: the caller notifies it of events.
+        state: the drone's state, which the caller keeps up to date.
+        monitor: the drone's monitor, which the caller notifies of events.
         outbox: messages for the clients, until `take` returns them.
     """
 
@@ -402,7 +403,7 @@ class MavlinkVehicle:
 
 
 def _requested_position(state: VehicleState, request: Request) -> Vector | None:
-    """Return a command's position in W, None if invalid; the vehicle's own coordinates replace non-finite ones."""
+    """Return a command's position in W, with the vehicle's own for non-finite coordinates; None if it is invalid."""
     params, frame = request.params, request.frame
     item = PlanItem(frame, request.command, params[:4], *params[4:])
     if frame not in FRAMES or (abs(item.x) > 180.0 and frame not in LOCAL):
@@ -485,7 +486,7 @@ def _yaw(mask: TypeMask, yaw: float, yaw_rate: float, frame: int, state: Vehicle
 
 
 def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoint | str:
-    """Return the target of a SET_ATTITUDE_TARGET, or the reason for a refusal; half thrust carries the weight [N]."""
+    """Return the target of a SET_ATTITUDE_TARGET, or the reason for a refusal; half thrust balances the weight."""
     mask = AttitudeMask(message.type_mask & 0xFF)
     values = (*message.q, message.thrust, message.body_yaw_rate)
     if mask & AttitudeMask.ATTITUDE:
@@ -577,7 +578,7 @@ class DroneMonitor:
 
 
 class Circle(NamedTuple):
-    """A circle of the fence, which must not be left (`inside`) or not be entered."""
+    """A circle of the fence, which must not be left (if `inside`) or not be entered."""
 
     centre_m: Point
     radius_m: float
@@ -588,7 +589,7 @@ class Circle(NamedTuple):
 
 
 class Polygon(NamedTuple):
-    """A polygon of the fence, which must not be left (`inside`) or not be entered."""
+    """A polygon of the fence, which must not be left (if `inside`) or not be entered."""
 
     corners_m: tuple[Point, ...]
     inside: bool

@@ -15,7 +15,7 @@ from zsim_bridges.mavlink.dialect import FENCE, MISSION, Cmd, MavFrame, MissionR
 from zsim_bridges.mavlink.personality import Parameters
 from zsim_bridges.mavlink.vehicle_state import Target, VehicleState, is_valid_position
 
-JUMPS_MAX = 1000  # items skipped in succession before a mission counts as an endless loop of jumps
+JUMPS_MAX = 1000  # items skipped in succession before a mission is taken for an endless loop of jumps
 ABSOLUTE = (MavFrame.GLOBAL, MavFrame.GLOBAL_INT)
 RELATIVE = (
     MavFrame.GLOBAL_RELATIVE_ALT,
@@ -29,7 +29,7 @@ COMMANDS: tuple[Any, ...] = (
     *(Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_RETURN_TO_LAUNCH, Cmd.NAV_LAND),
     *(Cmd.NAV_TAKEOFF, Cmd.NAV_DELAY, Cmd.DO_JUMP, Cmd.DO_CHANGE_SPEED),
 )
-ITEMS_MAX = 1000  # items in one mission; design choice: autopilots store some hundreds
+ITEMS_MAX = 1000  # items in one mission; design choice: autopilots store several hundred
 RETRY_NS = 500_000_000  # ns of wall time after which a missing item is requested again
 TRIES_MAX = 10
 FENCE_COMMANDS: tuple[Any, ...] = (
@@ -58,7 +58,7 @@ class PlanItem(NamedTuple):
 
 
 class MissionReport(NamedTuple):
-    """A mission's progress, for the run's record: `done` of `items`, not counting ArduPilot's item 0.
+    """A mission's progress, for the run's record: `done` of `items` items, not counting ArduPilot's item 0.
 
     Attributes:
         reason: why the mission was aborted; "" if it was not.
@@ -81,7 +81,7 @@ class MissionStep(NamedTuple):
 
 
 def position_of(item: PlanItem, state: VehicleState) -> Vector:
-    """Return an item's position in W [m]; x or y not given is the vehicle's, z not given is 0 in the item's frame."""
+    """Return an item's position in W [m]; a missing x or y is the vehicle's, a missing z is 0 in the item's frame."""
     current_x, current_y, _ = state.position_m
     z = item.z if math.isfinite(item.z) else 0.0
     if item.frame in LOCAL:
@@ -184,7 +184,7 @@ class Mission:
     # Steps
 
     def takeoff_height_m(self, state: VehicleState) -> float | None:
-        """Return the height z in W to which the mission takes off; None if the current item is not a take-off."""
+        """Return the height z in W at which the current item's take-off ends; None if the item is another one."""
         item = self._item
         return position_of(item, state)[2] if item and item.command == Cmd.NAV_TAKEOFF else None
 
@@ -278,7 +278,7 @@ class MissionProtocol:
     Args:
         on_loaded: called with the type and the items of a complete upload, or with no items after a removal.
         home_item: returns item 0 of ArduPilot's missions; None for PX4, whose item 0 is the first waypoint, and which
-            requests items in the form MISSION_ITEM_INT first.
+            first requests an item as MISSION_ITEM_INT.
     """
 
     def __init__(

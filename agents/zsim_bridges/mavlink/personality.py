@@ -1,4 +1,4 @@
-"""How PX4 and ArduPilot differ for clients: modes, parameters, and rules for offboard flight.
+"""How PX4 and ArduPilot differ for clients: modes, parameters, fence actions, and rules for offboard flight.
 
 Sources: PX4-Autopilot, src/modules/commander/px4_custom_mode.h and the parameter reference; ArduPilot,
 ArduCopter/mode.h and the parameter list of Copter.
@@ -65,7 +65,7 @@ PX4_FENCE = {  # GF_ACTION
     1: FenceAction.WARN,
     2: FenceAction.HOLD,
     3: FenceAction.RETURN,
-    4: FenceAction.WARN,  # "terminate" only warns, see docs/mavlink.md
+    4: FenceAction.WARN,  # "terminate" only warns; see docs/mavlink.md
     5: FenceAction.LAND,
 }
 COPTER_FENCE = {  # FENCE_ACTION
@@ -92,7 +92,7 @@ Setting = Literal[
 
 
 class ParameterSpec(NamedTuple):
-    """A parameter with its initial value and range; fixed ones cannot be set. The setting is the value times `unit`."""
+    """A parameter, its initial value and range; a fixed one cannot be set. The setting is the value times `unit`."""
 
     name: str
     type: ParamType
@@ -237,7 +237,7 @@ class Parameters:
         return map(self.message, self._names)
 
     def find(self, name: str, index: int) -> str | None:
-        """Return the name of the parameter with an index or, if that is -1, a name; None if it does not exist."""
+        """Return the name of the parameter with this index or, if it is negative, this name; None if there is none."""
         if index >= 0:
             return self._names[index] if index < len(self._names) else None
         return name if name in self._specs else None

@@ -1,7 +1,7 @@
 """The telemetry of a vehicle: its messages, each built from the state at one gate, and their rates.
 
-A builder returns None if there is nothing to send or its sensor has failed. Messages that are due at the same gate are
-sent in the order of TELEMETRY_ROWS, followed by those that a client has switched on.
+A builder returns None if there is nothing to send, for example after its sensor has failed. Messages that are due at
+the same gate are sent in the order of TELEMETRY_ROWS, followed by those that a client has switched on.
 """
 
 import math
@@ -280,7 +280,7 @@ def altitude(s: TelemetrySource) -> WireMessage:
 
 
 def _estimator_flags(s: TelemetrySource) -> int:
-    """Return the estimator's flags: all, without the absolute position if it is estimated and the GPS has failed."""
+    """Return the estimator's flags: all, except the absolute position's if it is estimated and the GPS has failed."""
     if s.state.is_estimated and s.state.has_failed("gps"):
         return dialect.ALL_ESTIMATED & ~(dialect.POS_HORIZ_ABS | dialect.PRED_POS_HORIZ_ABS)
     return dialect.ALL_ESTIMATED
@@ -293,7 +293,7 @@ def estimator_status(s: TelemetrySource) -> WireMessage:
 
 
 def _milli_readings(s: TelemetrySource) -> tuple[int, ...] | None:
-    """Return specific force [mg], body rate [mrad/s] and magnetic field [mgauss], in forward, right, down."""
+    """Return specific force [mg], body rate [mrad/s] and magnetic field [mgauss] along forward, right, down."""
     imu, mag = s.sample("imu"), s.state.samples.get("mag")
     if imu is None:
         return None

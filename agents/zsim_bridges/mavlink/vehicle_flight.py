@@ -157,7 +157,7 @@ class Flight:
         if reason is None and self._control.climb_to_m is None:
             self._control.hold(target)
             if isinstance(target, Target) and self._is_armed and not self._state.is_airborne:
-                z = target.position_m[2]  # only a target above, or an upward velocity, starts a take-off
+                z = target.position_m[2]  # only a target above the drone, or an upward velocity, starts a take-off
                 if target.velocity_m_s[2] > 0.0 or (
                     z is not None and z > self._state.position_m[2] + CLIMB_TOLERANCE_M
                 ):
@@ -232,7 +232,7 @@ class Flight:
             self._fly_home()
         elif self.mode is FlightMode.LAND:
             self._control.request("land")
-        elif self._is_stream_silent() and self.target is not None:  # ArduPilot keeps a position without a stream
+        elif self._is_stream_silent() and self.target is not None:  # ArduPilot holds a position without a stream
             if self.mode is FlightMode.OFFBOARD and self._personality.is_px4:
                 self._report(Severity.WARNING, "Offboard lost: no setpoints; holding")
                 self._enter(FlightMode.HOLD)
@@ -344,7 +344,7 @@ class FlightControl:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the target never brings the vehicle to rest, as with a velocity, a turn or a tilt."""
+        """Whether the target keeps the vehicle in motion, as a velocity, a turn or a tilt does."""
         target = self.target
         if not isinstance(target, Target):
             return target is not None
@@ -450,6 +450,6 @@ class FlightControl:
         return self._course.velocity(t_s, position, rates)
 
     def _motion(self) -> tuple[float, tuple[float, ...], tuple[float, ...]]:
-        """Return simulated time [s], position and heading, and their rates; the yaw rate counts as 0."""
+        """Return simulated time [s], position and heading, and their rates; the yaw rate is taken as 0."""
         state = self._state
         return state.t_ns * 1e-9, (*state.position_m, state.yaw_rad), (*state.velocity_m_s, 0.0)

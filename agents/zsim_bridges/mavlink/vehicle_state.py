@@ -17,7 +17,7 @@ from zsim_bridges.mavlink.dialect import SensorBit
 from zsim_bridges.vehicle_links.drone_link import BodyAxes, has_attitude
 
 ESTIMATE_AGE_MAX_NS = 500_000_000  # ns; an older estimate is not used
-MISSED_SAMPLES_MAX = 5  # periods without a sample after which a sensor counts as failed
+MISSED_SAMPLES_MAX = 5  # periods without a sample after which a sensor is considered failed
 LOW_BATTERY_PERCENT = 20.0  # above BAT_CRIT_THR and the like, so that the pilot is warned before these act
 AIRBORNE_STATES = ("taking_off", "hovering", "flying", "landing")
 SENSORS = {
@@ -39,7 +39,7 @@ class VehicleState:
 
     Attributes:
         t_ns: simulated time of the newest status.
-        position_m, velocity_m_s: in W; q_WB, rate_rad_s: attitude, and angular rate in the body.
+        position_m, velocity_m_s: in W; q_WB, rate_rad_s: attitude, and angular rate in body axes.
         is_estimated: whether position, velocity and attitude are the estimator's.
         sigma_m: standard deviations of the horizontal and the vertical position; 0 for the truth.
         samples: newest sample of each sensor, by name; those of the IMU and the magnetometer in body axes.
@@ -173,7 +173,7 @@ class Target(NamedTuple):
         velocity_m_s: velocity added to the one towards the position.
         yaw_rad: counter-clockwise from east; None to turn at `yaw_rate_rad_s`.
         yaw_rate_rad_s: counter-clockwise.
-        along_heading: whether the velocity is forward, left, up instead of in W.
+        along_heading: whether the velocity is forward, left, up rather than in W.
         speed_m_s: limit of the horizontal speed; None for the vehicle's own.
     """
 

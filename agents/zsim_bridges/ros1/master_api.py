@@ -1,4 +1,4 @@
-"""A node's dealings with its ROS master: XML-RPC calls, addresses, and a registration that outlives master restarts."""
+"""A node's interface to its ROS master: XML-RPC calls, addresses, and a registration that survives master restarts."""
 
 import http.client
 import os

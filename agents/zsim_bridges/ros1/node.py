@@ -27,7 +27,7 @@ Answer = list[Any]
 OK, ERROR, REFUSED = 1, -1, 0
 ALL_INTERFACES, LOOPBACK = "0.0.0.0", "127.0.0.1"
 STOP_POLL_S = 0.1  # period at which the XML-RPC server checks for its shutdown
-RETRY_S, RETRY_MAX_S = 0.5, 8.0  # first and longest pause between attempts to reach a publisher; it doubles each time
+RETRY_S, RETRY_MAX_S = 0.5, 8.0  # first and longest pause between attempts to reach a publisher, doubling each time
 DONE, FAILED = b"\x01", b"\x00"  # first byte of a service's response
 HEADER_MAX = 1_000_000  # bytes; the definitions of the largest messages take about 10 000
 FRAME_MAX = 1_000_000  # bytes; other nodes send only commands, which are short
@@ -62,7 +62,7 @@ class Ros1Node:
         self._connections: set[Task[Any]] = set()
 
     def publish(self, topic: str, kind: str, queue_size: int) -> "PublishedTopic":
-        """Publish a topic; to be called before `running`."""
+        """Advertise a topic, before `running`."""
         published = self.published[topic] = PublishedTopic(topic_type_of(topic, kind), queue_size)
         return published
 
@@ -186,7 +186,7 @@ class SlaveApi:
         ]
 
     def getBusStats(self, caller: str) -> Answer:
-        """Return the bytes sent per topic, and of each connection number, bytes, the topic's messages, and state.
+        """Return the bytes sent per topic, and each connection's number, bytes, the topic's message count, and state.
 
         Subscribed topics and services are not included.
         """
@@ -228,7 +228,7 @@ class PublishedTopic:
         self.sent = 0
 
     def publish(self, make_message: Callable[[int], Any]) -> None:
-        """Send what `make_message` returns for a sequence number; it is called only if there are subscribers."""
+        """Send what `make_message`, called only if there are subscribers, returns for a sequence number."""
         if not self.links:
             return
         framed = frame(serialize(self.topic_type.type, make_message(self.sent)))
@@ -329,7 +329,7 @@ class SubscribedTopic:
         self.connected: dict[str, str] = {}
 
     def update(self, publishers: Iterable[str], is_complete: bool = True) -> None:
-        """Follow publishers, given by the URIs of their slave APIs: only these if `is_complete`, otherwise these too.
+        """Follow publishers, given by the URIs of their slave APIs: only these if `is_complete`, else these as well.
 
         Messages that a publisher sent before it left the graph may still be in transit, so its connection is read to
         the end.

@@ -47,9 +47,9 @@ UNKNOWN_COVARIANCE = np.zeros(9)
 DRIVER_QUEUE = 200  # messages, as in the driver's publishers
 CAMERA_QUEUE = 10  # images, as in the driver's image publishers
 DEFAULT_QUEUE = 100  # messages, in all other publishers
-NEARLY_ZERO = 1e-6  # magnitude below which a component of cmd_vel counts as zero; the driver's _EPS
+NEARLY_ZERO = 1e-6  # magnitude below which a component of cmd_vel is taken as zero; the driver's _EPS
 COMMANDABLE_STATES = ("taking_off", *AIRBORNE)
-FramePose = tuple[str, Vector, Quaternion]  # frame of a part, and its pose in the body
+FramePose = tuple[str, Vector, Quaternion]  # name of a part's frame, and the frame's position and orientation in B
 Navdata = message_class("ardrone_autonomy/Navdata")
 
 
@@ -168,7 +168,7 @@ def camera_frame(name: str, camera: str) -> str:
 
 
 class DroneTopics:
-    """Topics and services of a drone; commands are sent in the name of `source`, `tf` is shared by all drones."""
+    """Topics and services of a drone; commands are sent in the name of `source`; `tf` is shared by all drones."""
 
     def __init__(
         self, node: Ros1Node, drone: Drone, source: str, put: Callable[[str, Any], None], tf: PublishedTopic
@@ -212,7 +212,7 @@ class DroneTopics:
 
 
 class TiltCommand(NamedTuple):
-    """A cmd_vel within its limits: fractions of the maximum tilt, climb and yaw rate."""
+    """A cmd_vel within its limits: fractions of the maximum tilt, climb rate and yaw rate."""
 
     forward: float
     left: float
@@ -222,7 +222,7 @@ class TiltCommand(NamedTuple):
 
 
 class DriverCommands:
-    """Passes commands from ROS nodes to one drone, by the driver's rules.
+    """Passes commands from ROS nodes to one drone, following the driver's rules.
 
     Like the driver, it repeats the last cmd_vel until another arrives, or until the drone no longer flies.
     """
@@ -268,8 +268,8 @@ class DriverCommands:
 def tilt_of(twist: Any) -> TiltCommand:
     """Return the AR.Drone's command for a geometry_msgs/Twist.
 
-    linear.x and linear.y are fractions of the maximum tilt, forward and to the left; linear.z of the maximum climb;
-    angular.z of the maximum yaw rate, counter-clockwise. If all six are zero, the drone hovers in place.
+    linear.x and linear.y are fractions of the maximum tilt, forward and to the left; linear.z of the maximum climb
+    rate; angular.z of the maximum yaw rate, counter-clockwise. If all six are zero, the drone hovers in place.
 
     Raises:
         ValueError: a component is not finite.
@@ -283,7 +283,7 @@ def tilt_of(twist: Any) -> TiltCommand:
 
 
 class CameraTopics:
-    """Topics of a drone's cameras, as the driver has them with image_transport, and the service togglecam.
+    """Topics of a drone's cameras, as the driver publishes them with image_transport, and the service togglecam.
 
     Each camera has topics of its own; a further set carries the active camera, which the service changes. Since
     images are large, those of a camera are read only while a node subscribes to them.
@@ -373,7 +373,7 @@ def navdata(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
 
 
 def imu(seq: int, sample: messages.Imu, attitude: Quaternion, frames: DriverFrames) -> Any:
-    """Return ardrone/imu: attitude, rate and specific force in B, the latter (0, 0, 9.8) m/s^2 at rest."""
+    """Return ardrone/imu: attitude, and in B the angular rate and the specific force, (0, 0, 9.8) m/s^2 at rest."""
     return ros.imu(
         header(seq, sample.t_sample_ns, frames.base),
         sample,
@@ -394,9 +394,9 @@ def fix(seq: int, sample: messages.Gps, frames: DriverFrames) -> Any:
 
 
 def odometry(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
-    """Return ardrone/odometry, whose pose integrates the aircraft's own velocity since the start.
+    """Return ardrone/odometry, whose position is integrated from the aircraft's own velocity since the start.
 
-    The velocity is navdata's, along the level axes x forward, y left, z up.
+    The velocity is navdata's, in level axes: x forward, y left, z up.
     """
     assert state.status is not None
     velocity = state.flow.velocity_m_s if state.flow else (0.0, 0.0, 0.0)
@@ -416,7 +416,7 @@ def ground_truth(seq: int, truth: flight_messages.Truth, frames: DriverFrames) -
 
 
 def transforms(seq: int, state: OnboardState, frames: DriverFrames, parts: Sequence[FramePose] = ()) -> Any:
-    """Return a drone's `/tf`: odom to base as integrated, world to odom if estimated, and base to its parts."""
+    """Return a drone's `/tf`: odom to base as integrated, world to odom if there is an estimate, and base to parts."""
     assert state.status is not None
     t_ns = state.status.t_ns
     poses = [ros.transform(header(seq, t_ns, frames.odom), frames.base, state.position_m, state.attitude)]

@@ -1,4 +1,4 @@
-"""A ROS 2 context on the wire of rmw_zenoh: types and their hashes, names, keys and tokens; nodes and endpoints.
+"""A ROS 2 context in rmw_zenoh's wire format: types and their hashes, names, keys and tokens; nodes and endpoints.
 
 Follows ros2/rmw_zenoh as shipped with Jazzy (from 0.2.4), Kilted and Rolling: `liveliness_utils.cpp` for tokens and
 quality of service, `attachment_helpers.cpp` for attachments. Humble's version has neither type hashes nor this
@@ -24,7 +24,7 @@ from rosbags.typesys.store import Typestore
 from zsim.transport.session import Query, RawSample, Session
 
 CDR = "application/cdr"
-_INVALID_CHARACTERS = re.compile(r"[^a-z0-9]+")  # each run becomes one underscore, since ROS reserves double ones
+_INVALID_CHARACTERS = re.compile(r"[^a-z0-9]+")  # each sequence becomes one underscore, since ROS reserves double ones
 TOKEN_SPACE = "@ros2_lv"  # prefix of all tokens; `**` does not match it
 TOKEN_PARTS = 13  # parts of an endpoint's token
 GID_BYTES = 16
@@ -134,7 +134,7 @@ def gid_of(token: str) -> bytes:
 
 
 class Attachment(NamedTuple):
-    """The attachment of a message, request or reply: sequence number (from 1), wall time [ns], sender (client) gid."""
+    """An attachment: sequence number (from 1), wall time [ns], and gid of the sender or, in a reply, of the client."""
 
     sequence: int
     wall_ns: int
@@ -185,7 +185,7 @@ class RosContext:
 
 
 class Ros2Node:
-    """A node of a context. An endpoint's token is declared only once it works, since others may use it at once."""
+    """A node of a context. It declares an endpoint's token last, since other nodes may use the endpoint at once."""
 
     def __init__(self, context: RosContext, identity: NodeId) -> None:
         self._context = context
@@ -193,7 +193,7 @@ class Ros2Node:
         context.link.declare_token(node_token(identity))
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> "Publisher":
-        """Return a publisher of a topic, given by its full name."""
+        """Return a publisher of the topic with this full name."""
         key, token = self._endpoint("MP", topic, kind, qos)
         publisher = Publisher(self._context, key, kind, qos, gid_of(token))
         self._context.link.declare_token(token)
@@ -216,7 +216,7 @@ class Ros2Node:
         return undeclare
 
     def service(self, name: str, kind: str, answer: Callable[[Any], Any]) -> None:
-        """Answer a service's requests with what `answer` returns for each; it is called in a Zenoh thread."""
+        """Answer a service's requests with what `answer`, called in a Zenoh thread, returns for each."""
         context = self._context
         key, token = self._endpoint("SS", name, kind, DEFAULT)
 
@@ -326,7 +326,7 @@ builtin_interfaces/Time stamp
 uint8[16] client_gid
 int64 sequence_number
 """
-"""From service_msgs; its `char[16]` counts as uint8 in type hashes."""
+"""From service_msgs, whose `char[16]` is hashed as `uint8[16]`."""
 
 PACKAGE = {  # a ROS 2 package that defines MESSAGES in ROS
     "package.xml": """\

@@ -1,7 +1,7 @@
 """The bridge between a run and ROS 2: topics, and subscriptions and services for commands.
 
-A topic's sources are read and converted only while a ROS node subscribes to it, so that without ROS nodes a run's clock
-is the only cost. The bridge never makes the world wait.
+A topic's sources are read and converted only while a ROS node subscribes to it, so that without ROS nodes, only a run's
+clock is read. The bridge never makes the world wait.
 """
 
 import math
@@ -313,7 +313,7 @@ class SourceSubscriptions:
     Args:
         refuse: called with a key or topic, and the reason why a message cannot be converted.
         is_prompt: whether estimates and cluster states are converted on arrival, rather than with the next clock:
-            waking up for each costs more than converting it, and only in realtime does a gate take long.
+            waking up for each message costs more than converting it, and only in realtime does a gate take long.
     """
 
     def __init__(
@@ -333,7 +333,7 @@ class SourceSubscriptions:
             self._by_key[key].readers.append(publication)
 
     def _open_source(self, key: str) -> SourceSubscription:
-        """Subscribe to a key. The world's messages have arrived when its clock does; others arrive at any time."""
+        """Subscribe to a key. The world's messages arrive before its clock; others arrive at any time."""
         if self._is_prompt and keys.leaf(key) in ("estimate", "state"):
             return SourceSubscription([], self._link.declare_subscriber(key, self._on_sample))
         subscription = self._link.subscribe(key)
@@ -360,7 +360,7 @@ class SourceSubscriptions:
             source.close()
 
     def convert_all(self, queued: Sequence[tuple[str, bytes]]) -> int:
-        """Convert and publish queued and polled samples in order of time; return their number.
+        """Convert and publish queued and polled samples in chronological order; return their number.
 
         If there are too many polled samples of a key, only the newest are converted.
         """
@@ -377,7 +377,7 @@ class SourceSubscriptions:
                     decoded.append((key, messages.decode(key, payload)))
                 except DecodeError as error:
                     self._refuse(key, messages.fault_at(key, error))
-        decoded.sort(key=lambda entry: (entry[1].t_ns, keys.is_status(entry[0])))  # like the world, status last
+        decoded.sort(key=lambda entry: (entry[1].t_ns, keys.is_status(entry[0])))  # the status last, as from the world
         for key, message in decoded:
             for publication in self._by_key[key].readers:
                 try:

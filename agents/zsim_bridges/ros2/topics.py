@@ -51,7 +51,7 @@ ZERO = (0.0, 0.0, 0.0)
 
 
 class Topic(NamedTuple):
-    """A topic that the bridge publishes; `convert` returns the ROS message for (key, message), None if none is due."""
+    """A topic that the bridge publishes; `convert` returns the ROS message for a key's message, None if none is due."""
 
     name: str
     kind: str
@@ -375,7 +375,7 @@ def cluster_topics(cluster: str, name: str) -> Iterator[Topic]:
 
 
 def cluster_pose(message: ClusterState) -> tuple[Vector3, Quaternion]:
-    """Return the estimated position and orientation of the cluster frame C in W; a pair has no roll."""
+    """Return the estimated position and orientation of the cluster frame C in W; the roll of a pair of drones is 0."""
     values = dict(zip(message.names, message.value, strict=True))
     x, y, z, roll, pitch, yaw = (values.get(each, 0.0) for each in ("x_c", "y_c", "z_c", "roll", "pitch", "yaw"))
     rpy = (roll, pitch, yaw)

@@ -1,4 +1,4 @@
-"""The driver process: presents an aircraft at the other end of a wire as one drone of a run.
+"""The driver process: presents an aircraft at the other end of a link as one drone of a run.
 
 The session with the aircraft and the failsafe, which perform no I/O, are in other modules; this one has the drone's
 messages and keys, the sockets, the event loop, and the command-line options.
@@ -54,7 +54,7 @@ class DriverOptions(NamedTuple):
         drone: the drone of the run that the aircraft represents.
         origin_m: origin of the aircraft's own frame, or its initial position [m; W]; None for the one that the aircraft
             reports or the scenario states.
-        yaw_deg: the aircraft's heading at the start, counter-clockwise from east; None for the heading by its compass.
+        yaw_deg: the aircraft's heading at the start, counter-clockwise from east; None to use its compass.
     """
 
     drone: str
@@ -248,7 +248,7 @@ class DriverProcess:
         return state, self._failsafe.phase, self._failsafe.reason
 
     def _report(self, now_ns: int) -> None:
-        """Publish the state of the link, and print changes of it."""
+        """Publish the state of the link, and print its changes."""
         state, phase, reason = now = self._current_report()
         if now != self._reported:
             self._say(f"link {state}, {phase}{f' ({reason})' if reason else ''}")
@@ -271,7 +271,7 @@ class DriverProcess:
         self._link.put(keys.link(self._drone), message)
 
     async def _land_and_leave(self, is_interrupted: bool) -> None:
-        """Land an aircraft that this driver still flies, or finish a kill; a replacement driver takes over instead."""
+        """Land an aircraft that this driver still flies, or finish a kill; leave both to a driver that replaces it."""
         if self._observer.superseded:
             return
         reason = "its driver is stopped" if is_interrupted else self._observer.end_reason or RUN_ENDED
@@ -311,8 +311,8 @@ class ExternalDrone:
 
     Args:
         to_simulated: converts a time of this process's clock to simulated time.
-        hover_rad_s: speed of each rotor when hovering, published in flight because no wire reports rotor speeds and
-            other drones fly in the downwash.
+        hover_rad_s: speed of each rotor when hovering, published in flight because no wire protocol reports rotor
+            speeds and other drones fly in the downwash.
 
     Attributes:
         readings: readings for the next gate, appended by the caller.
@@ -412,7 +412,7 @@ class AircraftSocket(asyncio.DatagramProtocol):
         self._receive(data)
 
     def error_received(self, exc: Exception) -> None:
-        """Record why a datagram was not delivered, usually because nobody listens yet; due messages are repeated."""
+        """Record why a datagram was not delivered, usually because nobody listens yet; sessions repeat messages."""
         self.fault = getattr(exc, "strerror", None) or str(exc)
 
 
@@ -459,7 +459,7 @@ def aircraft_host(text: str) -> str:
 
 
 def check_host(host: str) -> None:
-    """Refuse an unknown host before this driver replaces one in flight.
+    """Refuse an unknown host before this driver replaces another in flight.
 
     Raises:
         RunError: the host is unknown.

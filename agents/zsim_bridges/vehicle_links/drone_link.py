@@ -1,4 +1,4 @@
-"""A bridge's link to one drone: the commands sent to it, and the state known to its electronics. No I/O."""
+"""A bridge's link to one drone: the commands sent to it, and the state known to its onboard electronics. No I/O."""
 
 import math
 from collections import deque
@@ -14,8 +14,8 @@ from zsim.math.rotation import LEVEL, Vector
 from zsim.sensors.sensor import Mount
 from zsim_agents.estimation.strapdown import madgwick_step
 
-BETA_RAD_S = 0.02  # gain of Madgwick's filter, which levels within seconds and is hardly disturbed by manoeuvres
-REPEAT_NS = 100_000_000  # repetition period of setpoints: a commander silent for 0.5 s is lost (`silence.hover_s`)
+BETA_RAD_S = 0.02  # gain of Madgwick's filter, with which it levels within seconds and manoeuvres hardly disturb it
+REPEAT_NS = 100_000_000  # period of repeated setpoints: a commander is lost after 0.5 s of silence (`silence.hover_s`)
 STEP_S_MAX = 0.1  # s; the filter does not integrate over longer gaps between IMU samples
 POSITIONS_MAX = 32  # gates for which the integrated position is remembered; an estimate is at most a few gates late
 ModeName = Literal["takeoff", "land", "emergency", "reset"]
@@ -163,7 +163,7 @@ class OnboardState:
 
 
 def has_attitude(estimate: flight_messages.Estimate) -> bool:
-    """Return whether an estimate has an attitude; an estimator that has only positions may publish zeros."""
+    """Return whether an estimate has an attitude; an estimator of positions alone may publish zeros."""
     return abs(math.hypot(*estimate.orientation_wxyz) - 1.0) <= flight_messages.UNIT_SLACK
 
 

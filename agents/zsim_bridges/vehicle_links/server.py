@@ -1,4 +1,4 @@
-"""Servers that present one run's drones as aircraft on a wire; they send commands, but no gate waits for them."""
+"""Servers that present one run's drones to clients as aircraft; they send commands, but no gate waits for them."""
 
 import asyncio
 import contextlib
@@ -115,7 +115,7 @@ Say = Callable[[str], None]
 
 
 class VehicleServer(ABC):
-    """One run's drones on a wire; `options` are those of the wire, and `serve` requests the pace `options.rate`."""
+    """Serves one run's drones over a wire protocol with its own `options`; `serve` requests the pace `options.rate`."""
 
     def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: Any) -> None:
         self.link = link
@@ -186,7 +186,7 @@ class VehicleServer(ABC):
         self.say_once(reason)
 
     def say_once(self, text: str) -> None:
-        """Print a text once; texts that differ only in numbers count as equal."""
+        """Print a text once; texts that differ only in numbers are treated as equal."""
         reason = without_numbers(text)
         if reason not in self._reported and len(self._reported) < REPORTED_MAX:
             self._reported.add(reason)

@@ -1,7 +1,7 @@
-"""The wire-independent parts of a driver: demands on an aircraft, and the session that carries them out. No I/O.
+"""The protocol-independent parts of a driver: demands on an aircraft, and the session that carries them out. No I/O.
 
 `Failsafe` turns accepted commands into demands within limits, and makes the aircraft hold or land if commands cease.
-Its rules, with times that pass at the rate of the run:
+Its rules, with times measured at the rate of the run:
 - Nothing is demanded before an operator has armed the driver.
 - After `silence.hover_s` without a setpoint the aircraft holds; after a further `silence.land_s`, it lands.
 - After the same total time without the world's clock, it lands, whoever is flying it.
@@ -12,7 +12,7 @@ Its rules, with times that pass at the rate of the run:
 - While nothing is received from the aircraft, only a landing, a stop or a reset is sent: after a power cycle, it might
   take the next setpoint or a repeated take-off for a new command.
 
-`VehicleSession` is the base class of the sessions on all wires, with the aircraft's readings and clock. Poses and
+`VehicleSession` is the base class of all protocols' sessions, with the aircraft's readings and clock. Poses and
 readings are timestamped by the clock of this process.
 """
 
@@ -29,7 +29,7 @@ from zsim.math.frames import geodetic_to_enu, heading, turned_about_up
 from zsim.math.rotation import LEVEL, Quaternion, Vector
 from zsim.scenario.scenario import Silence
 
-WINDOW_NS = 5_000_000_000  # design choice: much longer than queuing, yet with little clock drift (50 ppm: 0.25 ms)
+WINDOW_NS = 5_000_000_000  # design choice: much longer than queuing delays, with little clock drift (50 ppm: 0.25 ms)
 SIGMA_UNKNOWN_M = 2.0  # m, for a GPS receiver that does not report its accuracy (paper, section VI)
 P0_PA = 101_325.0  # Pa, pressure at sea level (ISO 2533)
 SCALE_M = 44_330.77  # m, T0 / lapse rate = 288.15 K / 6.5 K/km (ISO 2533)
@@ -71,7 +71,7 @@ class Demand(NamedTuple):
     """The current demand on an aircraft; velocities are in W, yaw rates counter-clockwise.
 
     Attributes:
-        action: what the aircraft should do; for `none`, nothing that starts or steers a motor is sent.
+        action: what the aircraft should do; for `none`, nothing that starts or controls a motor is sent.
     """
 
     action: Action
@@ -94,7 +94,7 @@ class FlightLimits(NamedTuple):
     ceiling_m: float = math.inf
 
     def limited(self, velocity_m_s: Sequence[float], position_m: Sequence[float] | None) -> tuple[float, float, float]:
-        """Return a velocity [m/s; W] reduced to the limits and, if the position is known, to stop before the fence."""
+        """Return a velocity [m/s; W] reduced to the limits and, at a known position, so as to stop before the fence."""
         x, y, z = velocity_m_s
         speed = el.hypot(x, y)
         scale = min(1.0, self.speed_m_s / speed) if speed else 1.0
@@ -129,7 +129,7 @@ class Failsafe:
     Attributes:
         armed: whether commands are obeyed.
         commander: source of the last setpoint; None once the world or a landing has ended its control.
-        reason: why the aircraft last left the commander's control; empty for never.
+        reason: why the aircraft last left the commander's control; empty if it never did.
     """
 
     def __init__(self, silence: Silence, limits: FlightLimits, armed: bool = False) -> None:
@@ -247,7 +247,7 @@ class Failsafe:
     def _advance_phase(self, now_ns: int, vehicle: AircraftState) -> None:
         """Enter the phase that the aircraft has reached, or that a silence, a time limit or the fence requires."""
         is_airborne = vehicle.state in AIRBORNE
-        has_had_time = now_ns - self._entered_ns > LINK_LOST_S * 1e9  # for the telemetry to show that it obeys
+        has_had_time = now_ns - self._entered_ns > LINK_LOST_S * 1e9  # for its telemetry to show that it obeys
         if self.phase in ("taking_off", "airborne") and vehicle.state == "emergency":
             self.reason, self._is_uncommanded = "the aircraft is in an emergency", True
             self._end_flight(now_ns)
@@ -330,7 +330,7 @@ class LinkQuality(NamedTuple):
 
 
 class VehicleSession(ABC):
-    """The state machine of one aircraft at the other end of a wire. No I/O: the process passes in the time.
+    """The state machine of one aircraft at the other end of a link. No I/O: the process passes in the time.
 
     Args:
         channels: the aircraft's ports; a channel number is an index into them.
@@ -451,7 +451,7 @@ class AircraftReadings:
     def gps_values(
         self, geodetic: Vector, speed_m_s: float, course_rad: float, sigma_m: float, fix: int, satellites: int
     ) -> tuple:
-        """Return the values of a fix, with its position in W; the climb rate is the pose's, since the wires send none.
+        """Return the values of a fix, with its position in W; the climb rate is the pose's, as the protocols send none.
 
         Args:
             geodetic: latitude, longitude [deg], height [m].
@@ -475,7 +475,7 @@ class ClockOffset:
     """Estimates the offset of another clock from this one, based on messages with timestamps.
 
     It uses the minimum difference between arrival and timestamp within a window, since delays by a link or a busy
-    process are never negative. The minimum delay is half of the shortest round trip, if round trips are measured.
+    process are never negative. The minimum delay is taken as half the shortest round trip, if round trips are measured.
     """
 
     def __init__(self) -> None:

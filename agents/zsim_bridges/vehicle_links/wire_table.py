@@ -1,7 +1,7 @@
 """The messages of a wire protocol as a text table, and the byte layout of their fields.
 
-Each entry of a table starts a line with its number and name; its fields follow in their order of definition, and may
-continue on indented lines:
+Each entry of a table begins on a new line with its number and name; its fields follow in their order of definition, and
+may continue on indented lines:
 
     77 COMMAND_ACK command:H result:B | progress:B result_param2:i target_system,target_component:B
     148 EXAMPLE voltages:10H[mV]=65535 text:50c uid:18s
@@ -35,7 +35,7 @@ class WireField(NamedTuple):
 
     @property
     def is_array(self) -> bool:
-        """Whether the struct module has several values for the field; a text or an array of bytes is one value."""
+        """Whether the struct module takes several values for the field; a text or an array of bytes is one value."""
         return self.length is not None and self.code not in "cs"
 
     @property

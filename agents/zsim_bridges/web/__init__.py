@@ -1,6 +1,6 @@
 """Parts shared by the web servers: event loop thread, listening, access, bounded connections.
 
-Console and gateway use them for HTTP. This module does not import aiohttp, since other bridges use it too.
+The console and the gateway use them for HTTP. This module does not import aiohttp, since other bridges use it too.
 """
 
 from ipaddress import ip_address

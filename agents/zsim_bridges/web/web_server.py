@@ -29,7 +29,7 @@ ERROR_STATUS_MIN = 400  # lowest HTTP status of an error
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 ANY_PORT = 0  # lets the kernel choose
 BACKLOG = 128  # connections that the kernel queues until they are accepted; aiohttp's default
-READ_BYTES = 16_384  # buffer for a body that no handler has read yet; a connection holds twice as much
+READ_BYTES = 16_384  # buffer for a body that no handler has read yet; a connection buffers up to twice as much
 Resource = TypeVar("Resource")
 _NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests that are not HTTP are answered, but not logged
 
@@ -53,7 +53,7 @@ class ServedSite(NamedTuple):
 async def start_site(app: web.Application, host: str, ports: Sequence[int], shutdown_s: float) -> ServedSite:
     """Serve an application on the first free port, where ANY_PORT stands for any, with a bounded number of connections.
 
-    At shutdown, requests in progress may take `shutdown_s` [wall]. Raises an OSError if no port can be opened.
+    At shutdown, requests in progress may take `shutdown_s` of wall time. Raises an OSError if no port can be opened.
     """
     connections = HttpConnections()
     app.middlewares.append(connections.observe)
@@ -121,7 +121,7 @@ def check_token(process: str, host: str, token: str | None) -> None:
 
 
 def tokens_match(received: str, token: str) -> bool:
-    """Compare two tokens in constant time; the received one may hold any bytes of a header."""
+    """Compare two tokens in constant time; the received one may contain any bytes of a header."""
     return hmac.compare_digest(received.encode(errors="surrogatepass"), token.encode(errors="surrogatepass"))
 
 
@@ -179,7 +179,7 @@ class HttpConnections:
     async def _receive(
         self, request: web.Request, connection: "HttpConnection", since_s: float | None, reservations: AsyncExitStack
     ) -> None:
-        """Receive the body of a request before the handler runs; `reservations` holds its room until that has finished.
+        """Receive the body of a request before the handler runs; `reservations` keep its room until the handler ends.
 
         Raises aiohttp's errors for a body that is too long or did not arrive in time, for instance for lack of room.
         """
@@ -270,7 +270,7 @@ class HttpConnection(asyncio.Protocol):
         self.is_complete = False  # whether the request in progress has arrived completely
         self.has_more = False  # whether part of the next request has arrived meanwhile
         self.since_s: float | None = None  # loop time at which the first byte of its next request arrived
-        self.timer: asyncio.TimerHandle | None = None  # closes the connection when that request's time is over
+        self.timer: asyncio.TimerHandle | None = None  # closes the connection when that request's time has run out
 
     @property
     def is_open(self) -> bool:

@@ -1,4 +1,4 @@
-"""Flies a board (every law in every scenario with every seed) and makes its tables of means.
+"""Flies a board (every law in every scenario with every seed) and makes tables of the means.
 
 The folder of a board:
 
@@ -10,7 +10,7 @@ The folder of a board:
 
 A law is `cluster_space`, the stock controller with a template; one of `zsim.scenario.scenario.LAWS`; or a user's
 subclass of `zsim_agents.laws.pilot.Pilot`, `package.module:Class`. All fly the same drones from the same positions with
-the same sensors, wind and seeds; a law has its default parameters, except for the times and places of the plan.
+the same sensors, wind and seeds; a law has its default parameters, except for the times and positions of the plan.
 """
 
 import copy
@@ -106,16 +106,16 @@ class BoardRequest(Struct, frozen=True):
     seeds: int
     out: Path
     workers: int | None = None  # number of processes; None: one per core
-    force: bool = False  # whether the folder may hold other files
+    force: bool = False  # whether the folder may contain other files
     console: Console | None = None  # where progress is shown; None: stderr
 
 
 def fly_board(request: BoardRequest) -> list[Row]:
-    """Make the flights that the folder lacks; return the rows of all flights.
+    """Fly what the folder's journal lacks; return the rows of all flights.
 
     Raises:
         ScenarioError: a law cannot be flown; one line per fault.
-        RunError: the folder holds something else, is in use or cannot be written, or workers cannot start.
+        RunError: the folder contains something else, is in use or cannot be written, or workers cannot start.
         KeyboardInterrupt: the finished flights are in the journal.
     """
     tasks = _tasks(request)
@@ -297,7 +297,7 @@ def document(law: str, scenario: str, seed: int) -> dict[str, Any]:
 
 
 def _cluster(names: list[str], centre_m: list[float | str], flight: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the equivalent cluster: a pentagon template that gathers, then is led along the centre's path."""
+    """Return the equivalent cluster: a polygon as template, which gathers and then follows the centre's path."""
     positions = [[*position, 0.0] for position in polygon(len(names), flight["radius_m"]).tolist()]
     start = {"x_c": 0, "y_c": 0, "z_c": flight["height_m"], "yaw": 0}
     expressions = {"x_c": centre_m[0], "y_c": centre_m[1]}

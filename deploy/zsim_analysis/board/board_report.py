@@ -1,4 +1,4 @@
-"""Makes the report page of a board, with its tables and figures, and its tables for the terminal.
+"""Makes the report page of a board, with its tables and figures, and the tables for the terminal.
 
 Figures: all measures of all laws, the paths of the drones from above, and shape errors over time.
 """
@@ -30,7 +30,7 @@ from zsim_analysis.sweep.sweep_run import Row
 
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.VERMILION, style.SKY, style.PURPLE, style.BLACK, style.GREY)
 MARKERS = "osD^vP*X"
-ROW_IN, MARGIN_IN = 0.42, 0.9  # height of a law's line in a panel, and of everything around the axes
+ROW_IN, MARGIN_IN = 0.42, 0.9  # height of a law's row in a panel, and of everything around the axes
 PANEL_MIN_IN = 0.5  # minimum height of a row of path panels
 
 

@@ -1,13 +1,13 @@
-"""Measures, shared by all laws, of how well a formation was flown: errors and separation from the true motion within
-the report's window; effort, messages and CPU time over the whole flight.
+"""Measures of how well a formation was flown, the same for all laws.
 
-`measures` is a function for `report.metrics`, so that sweeps over a law's parameters can have them too:
+Errors and separation follow from the true motion within the report's window; effort, messages and CPU time are those
+of the whole flight. `measures` is a function for `report.metrics`, so that sweeps over a law's parameters can use it:
 
     zsim sweep scenario.yaml --vary agents.pilot.parameters.gain_1_s=0.2,0.4 \
         --set report.metrics=zsim_analysis.board.measures:measures
 
-Errors and separation are those of the drones in the air: if a formation has lost one, those of the others. The
-reference is always the plan's, even while drones are held.
+Errors and separation are those of the drones in the air only. The reference is always the plan's, even while drones
+are held.
 """
 
 from dataclasses import replace
@@ -43,7 +43,7 @@ class DesiredTrack(NamedTuple):
 
 
 class FormationTrack(NamedTuple):
-    """The horizontal motion of a formation within its window."""
+    """The horizontal motion of a formation, within the report's window or over the whole flight."""
 
     t_s: Array  # (T,)
     p: Array  # (T, n, 2) true positions [m; W]; NaN for drones that are not in the air
@@ -137,7 +137,7 @@ def shape_errors(formation: FormationTrack) -> Array:
 
 
 def lattice_errors(p: Array, spacing_m: float, reach_m: float) -> Array:
-    """Return the root mean square deviation from the spacing of sides shorter than `reach_m`, over time (T,) [m]."""
+    """Return the root mean square deviation of sides shorter than `reach_m` from the spacing, over time (T,) [m]."""
     i, j = np.triu_indices(p.shape[1], 1)
     lengths = np.linalg.norm(p[:, i] - p[:, j], axis=2)
     squared = np.where(lengths < reach_m, (lengths - spacing_m) ** 2, np.nan)

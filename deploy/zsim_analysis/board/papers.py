@@ -1,11 +1,11 @@
-"""Numbers and figures of the laws' papers, recomputed with the flown laws on ideal agents instead of drones.
+"""Numbers and figures of the laws' papers, recomputed with the laws as flown, but on ideal agents instead of drones.
 
 margins     R. Olfati-Saber, R. M. Murray, Consensus problems in networks of agents with switching topology and
             time-delays, IEEE Trans. Automatic Control 49 (2004): errors decay at the rate lambda_2, and consensus
-            oscillates from a delay of pi / (2 lambda_n) on, if an agent's own state is as delayed as the others'
+            oscillates from a delay of pi / (2 lambda_n) on, if an agent's own state is delayed like those of the others
 flocking    R. Olfati-Saber, Flocking for multi-agent dynamic systems: algorithms and theory, IEEE Trans. Automatic
             Control 51 (2006): relative connectivity, deviation energy and velocity mismatch of a flock in free space
-            with the paper's parameters, with and without the term for the group's aim
+            with the paper's parameters, with and without the term for the group objective
 bearings    S. Zhao, D. Zelazo, Bearing rigidity and almost global bearing-only formation stabilization, IEEE Trans.
             Automatic Control 61 (2016): centroid and scale are invariant, and the shape is reached from almost all
             starts
@@ -44,10 +44,10 @@ GRAPHS: dict[str, Graph] = {
 }
 STEPS_OF_DELAY = 120  # Euler steps per delay
 DELAYS = 80  # number of delays for which a network is integrated
-D, R, FLOCK, AREA_STD = 7.0, 8.4, 150, 50.0  # the paper's: spacing, range [m], agents, std of starts [m]
+D, R, FLOCK, AREA_STD = 7.0, 8.4, 150, 50.0  # the paper's spacing, range [m], number of agents, std of starts [m]
 FLOCK_C1 = {"alpha": 3.0, "gamma": 0.1}  # design choice, as the paper leaves these gains open
 REACHED_M = 1e-3
-STARTS = 10  # number of random starts of the formation by bearings
+STARTS = 10  # number of random starts of the formation controlled by bearings
 FLOCK_H_S, FLOCK_S = 0.02, 30.0
 
 

@@ -32,10 +32,10 @@ MEMBERS_MAX = 5000
 MANIFEST_BYTES_MAX = 4 << 20
 NAME_MAX = 200  # longest name of a member [characters]
 CHUNK_BYTES = 1 << 20
-DATE = (1980, 1, 1, 0, 0, 0)  # date of every member: the earliest that a zip archive can hold
+DATE = (1980, 1, 1, 0, 0, 0)  # date of every member: the earliest that a zip archive can store
 MODE = (stat.S_IFREG | 0o644) << 16
 UNIX = 3  # stored as the creating system on every system, so that the bytes are the same
-PIN = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?==[A-Za-z0-9][A-Za-z0-9.!+_]*")  # a line of the lock
+PIN = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?==[A-Za-z0-9][A-Za-z0-9.!+_]*")  # a line of the lock file
 EXTRAS = ("agents", "record", "report", "world")  # extras that a rerun and its figures need
 PART = re.compile(r"\w[\w.+@ -]*(?<![ .])")  # part of a member's path: no `..`, no drive, nothing hidden
 
@@ -95,7 +95,7 @@ def write_bundle(out: Path, manifest: Manifest, members: Mapping[str, Path | byt
     Args:
         out: path of the bundle.
         manifest: the manifest without `files`.
-        members: by path in the bundle, the content or the file that holds it.
+        members: by path in the bundle, the content or the file that contains it.
         force: whether to replace an existing file.
 
     Raises:
@@ -151,7 +151,7 @@ def is_bundle(path: Path) -> bool:
 
 
 def differing_packages(lock: Iterable[str]) -> list[str]:
-    """Return the packages of a lock that are installed here in another version, or not at all."""
+    """Return the packages of a lock file that are installed here in another version, or not at all."""
     differing = []
     for line in lock:
         name, _, version = line.partition("==")
@@ -165,7 +165,7 @@ def differing_packages(lock: Iterable[str]) -> list[str]:
 
 
 def pins_of(text: str, where: str) -> list[str]:
-    """Return the lines of a lock; raise RunError if one is not NAME==VERSION but, for example, an option or a URL."""
+    """Return a lock file's lines; raise RunError if one is not NAME==VERSION but, for example, an option or a URL."""
     lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     for line in lines:
         if not PIN.fullmatch(line):

@@ -1,4 +1,4 @@
-"""Flies a bundle again and compares the results with those it states."""
+"""Flies a bundle again and compares the results with those stated in it."""
 
 import time
 from collections.abc import Callable
@@ -63,11 +63,11 @@ def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
 
 
 def check_content(path: Path, manifest: Manifest, folder: Path) -> Scenario:
-    """Return the scenario of a bundle after checking that it matches manifest and record and may be flown here.
+    """Return the scenario of a bundle after checking that it matches the manifest and record and may be flown here.
 
     Raises:
-        RunError: the scenario does not match manifest and record, or names code that may not be run; or the bundle has
-            neither record nor gates.
+        RunError: the scenario does not match the manifest or record, or names code that may not be run; or the bundle
+            has neither record nor gates.
     """
     try:
         text = (folder / names.SCENARIO).read_text("utf-8")

@@ -51,7 +51,7 @@ PROJECT = "zsim"
 BYTES_MAX = 50_000_000  # largest total size of users' modules, which should hold code, not data
 MODULE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 PATH = re.compile(r"(?<![\w./~-])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:;,'\"()]+[/\\])+")  # the folders of an absolute path
-FREE_TEXT = ("text", "reason", "error", "failure")  # message fields that hold free text
+FREE_TEXT = ("text", "reason", "error", "failure")  # message fields with free text
 WALL_CLOCK_FIELDS = (
     *("run_id", "date", "changed", "versions", "fingerprint", "mode", "real_time_factor", "wall_s", "command_age_ms"),
     *("deadlines", "deadline_misses", "deadline_misses_by", "links", "participants", "events", "events_left_out"),
@@ -69,11 +69,11 @@ def make_bundle(
         out: the bundle file; None: named after the scenario, in the working folder.
         with_record: whether to include the record; may be False only if the scenario alone reproduces the flight.
         force: whether to replace an existing file.
-        note: called with a line for each thing that the bundle lacks or does not hide.
+        note: called with a line on each thing that the bundle lacks or does not conceal.
 
     Raises:
         RunError: the record is not that of a complete flight that can be flown again, the scenario names something
-            that a bundle cannot hold, or the file cannot be written.
+            that a bundle cannot contain, or the file cannot be written.
     """
     record = record_at(run_path)
     completeness = record_completeness(record)
@@ -348,7 +348,7 @@ def _imports(path: Path) -> set[str]:
 
 
 def package_pins(packages: Iterable[str] = ()) -> tuple[list[str], list[str]]:
-    """Return lines NAME==VERSION of all packages that zsim and the given packages need, and those of the given ones.
+    """Return lines NAME==VERSION for all packages that zsim and the given ones need, and those for the given ones.
 
     A package that was not installed from an index has no line.
 

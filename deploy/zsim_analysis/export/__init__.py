@@ -2,7 +2,7 @@
 
     export(DIR, Format.CSV, OUT, MessageSelection())     writes OUT completely or not at all
 
-Imports zsim_analysis.reading. This file needs no extra packages, as the command line imports the formats from it.
+Imports zsim_analysis.reading. This file needs no extra packages, since the command line imports the formats from it.
 """
 
 from enum import StrEnum

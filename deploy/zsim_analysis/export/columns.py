@@ -47,7 +47,7 @@ class MessageSelection(NamedTuple):
         return [key for key in reader.topics() if every or any(keys.matches(each, key) for each in self.expressions)]
 
     def messages(self, reader: RecordReader, selected_keys: list[str]) -> Iterator[Recorded]:
-        """Yield the messages on `selected_keys` within the times, in order of simulated time."""
+        """Yield the messages on `selected_keys` within the selected times, in order of simulated time."""
         first = 0 if self.from_s is None else round(self.from_s * 1e9)
         last = 2**64 if self.to_s is None else round(self.to_s * 1e9)
         return (message for message in reader.messages(frozenset(selected_keys)) if first <= message.t_ns <= last)
@@ -185,7 +185,7 @@ def _plain(name: str, kind: Kind, path: str = "", convert: Callable[[Any], Any] 
 
 
 def _open(name: str, names: Sequence[str], kind: str) -> Columns:
-    """Return a column for each name or key of an open field, or for pairs two: FIELD_KEY_used and FIELD_KEY_refused.
+    """Return a column for each name or key of an open field, or two for pairs: FIELD_KEY_used and FIELD_KEY_refused.
 
     Messages may differ in their `names`.
     """
@@ -268,7 +268,7 @@ class TableSurvey:
     """The tables of a selection, found in a first pass over the record: the `table_keys`, and `kinds`, their types.
 
     `pictures` is the number of pictures, which are in no table. `rows` counts messages by type (None for foreign keys),
-    including those that are outside the times or cannot be decoded.
+    including those that are outside the selected times or cannot be decoded.
     """
 
     def __init__(self, reader: RecordReader, selection: MessageSelection) -> None:
@@ -308,12 +308,12 @@ class TableSurvey:
         return sum(len(each.columns) for each in self.table(kind))
 
     def rows_within(self, kind: type[Struct]) -> int:
-        """Return the number of messages of a type within the times, by reading them all."""
+        """Return the number of messages of a type within the selected times, by reading them all."""
         matching_keys = [key for key, key_kind in self.kinds.items() if key_kind is kind]
         return sum(1 for _ in self._selection.messages(self._reader, matching_keys))
 
     def decode(self, recorded: Recorded) -> Any:
-        """Return the message, a Foreign if its key is not in the contract; None if it does not match its key's type."""
+        """Return the message, as a Foreign if its key is outside the contract; None if it is not of its key's type."""
         if recorded.key in self.kinds:
             return decode_or_none(recorded)
         try:

@@ -136,7 +136,7 @@ def _rotors(info: Info | None, scenario: Scenario | None, present: Mapping[str, 
 
 @dataclass
 class Instant:
-    """The messages of one time: the last one of each key, but all events and all camera messages."""
+    """The messages of one time: the last of each key, but all events and all camera messages."""
 
     t_ns: int
     truth: dict[str, Truth] = field(default_factory=dict)
@@ -307,7 +307,7 @@ class FoxgloveFile:
             self._log(ESTIMATES, channels.SceneUpdateChannel, scene, t_ns)
 
     def _places(self, name: str, state: ClusterState) -> Any:
-        """Return the desired positions of a cluster's drones (n, 3); None if they are unknown or singular."""
+        """Return the desired positions of a cluster's drones (n, 3); None if they are unknown or the shape singular."""
         space = self._spaces.get(name)
         if space is None or space.names != state.names or not any(state.desired):
             return None
@@ -336,7 +336,7 @@ class FoxgloveFile:
 
 
 def _camera_of(key: str) -> tuple[str, str]:
-    """Return a camera's drone and frame from its key; in the frame, x points right in the picture, y down, z ahead."""
+    """Return a camera's drone and frame from its key; its x is to the right of the image, y down, z forward."""
     _, drone, leaf = keys.parts(key)
     return drone, f"{build.frame(drone)}/{leaf.split('/')[1]}_camera"
 
