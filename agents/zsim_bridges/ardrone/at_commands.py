@@ -512,7 +512,7 @@ class Configuration:
 
 
 def _checked(key: str, entry: ConfigurationEntry, value: str) -> str:
-    """Return a value in its stored form, a number clipped to its range."""
+    """Return a value in its stored form, with a number clipped to its range."""
     if entry.kind == "fixed":
         raise ConfigurationError(f"{key} is read-only")
     if entry.kind == "text":

@@ -47,8 +47,8 @@ MAG_UT_PER_LSB = 0.3  # uT (AK8975 datasheet)
 MG_PER_UT = 10.0  # milligauss per microtesla
 PWM_MAX = 255  # PWM at a motor's maximum speed; assumed proportional to speed, since the true curve is not published
 VOLTAGE_MV = (0.0, 10.0, 50.0, 100.0), (9000.0, 10_500.0, 11_686.0, 12_500.0)
-"""Charges [%] and voltages [mV] of the battery: 0 % is the SDK's vbat_min, 50 % was measured on an aircraft, the others
-are assumed."""
+"""Charges [%] and voltages [mV] of the battery: 0 % is the SDK's vbat_min, 50 % was measured on an aircraft, and the
+other points are assumed."""
 SECONDS_MASK = 0x7FF  # the seconds in option `time` have 11 bits
 FIX_3D = 3  # fix type of a GPS receiver, as in NMEA
 _INT16 = 32_767

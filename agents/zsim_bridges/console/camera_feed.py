@@ -1,7 +1,7 @@
 """The cameras of a run for pages: their names, the newest picture of each watched one, and the marks drawn on it.
 
 Pictures may come from any program, so each is checked before a browser decodes it. Frames: B of the drone; K of the
-camera: x right, y down, z ahead. Pixel coordinates (0, 0) are the centre of the picture's upper left pixel.
+camera: x right, y down, z ahead. Pixel coordinates (0, 0) are the centre of the picture's upper-left pixel.
 """
 
 import math
@@ -34,7 +34,7 @@ AGE_MAX_NS = 300_000_000  # simulated; maximum time between a picture and sighti
 PICTURE_BYTES_MAX = 1_000_000  # maximum size of a picture; ten such pictures a second fill a link of 80 Mbit/s
 PIXELS_MAX = 1920 * 1200  # per picture; a scenario's cameras have 1920 × 1080 at most; a browser needs 4 bytes each
 JPEG_END = b"\xff\xd9"  # last bytes of a JPEG; ITU-T T.81, table B.1
-SUPPORTED_MARKERS = frozenset({0xC0, 0xC1, 0xC2})  # frames that browsers show: baseline, extended, progressive
+SUPPORTED_MARKERS = frozenset({0xC0, 0xC1, 0xC2})  # frame types that browsers show: baseline, extended, progressive
 
 
 class CameraPicture(NamedTuple):

@@ -84,7 +84,7 @@ class FormationForm:
 
     Args:
         report: called with the outcome of each request that is refused without being sent.
-        request_return: moves a formation above the middle of its drones' starts, and lands it there.
+        request_return: moves a formation to above the middle of its drones' starts, and lands it there.
         show_preview: shows in the scene the path that would be flown; None: removes it.
 
     Attributes:

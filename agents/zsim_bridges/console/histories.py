@@ -90,7 +90,7 @@ class CanvasTrails:
 
     Attributes:
         length_s: length of the trails, simulated.
-        number: changes whenever the trails are not just the previous ones extended.
+        number: changes whenever the trails change other than by extension.
     """
 
     def __init__(self, count: int, is_replay: bool = False) -> None:
@@ -129,7 +129,7 @@ class CanvasTrails:
         self.number += 1
 
     def segments(self, t_s: float, p_W: Array) -> tuple[Array, NDArray[np.int64], Array]:
-        """Return the trails as M segments, up to positions (N, 3) at `t_s`; many points are thinned out evenly.
+        """Return the trails as M segments that end at positions (N, 3) at `t_s`; many points are thinned out evenly.
 
         Returns:
             the segments' ends (M, 2, 3), indices of their drones (M,), and times at which they begin (M,).

@@ -42,7 +42,7 @@ CLIMB_SHARE = 0.5  # ratio of climb to horizontal speed; design choice: height i
 YAW_RATE_RAD_S = math.radians(45.0)  # design choice: a full turn in 8 s
 SPEED_M_S = 1.5  # speed towards a waypoint; design choice: the default speed limit of formations
 WAYPOINT_REACHED_M = 0.5  # distance from a waypoint at which a drone proceeds to the next one
-WAYPOINTS_MAX = 50  # maximum number per drone; design choice: more would no longer be manual flight
+WAYPOINTS_MAX = 50  # maximum number of waypoints per drone; design choice: more would no longer be manual flight
 BRAKE_S = 1.0  # time constant of braking before the fence; design choice: three times the lag of the velocity loop
 ABOVE_START_M = 0.5  # horizontal distance from its start at which a drone lands; design choice: the size of a hull
 OVER_STARTS_M = 0.5  # distance from the middle of its drones' starts at which a formation lands
@@ -124,7 +124,7 @@ class Geofence(NamedTuple):
         return ""
 
     def limit_velocity(self, velocity_W: Vector, p_W: Vector) -> Vector:
-        """Return a demanded velocity [m/s], slowed down so that a drone at `p_W` [m] comes to rest at the fence.
+        """Return a demanded velocity [m/s], reduced so that a drone at `p_W` [m] comes to rest at the fence.
 
         Braking begins BRAKE_S before the fence would be reached; a drone outside the fence may return.
         """
@@ -153,7 +153,7 @@ def stick_velocity(stick: Stick, pose: DronePose, limits: Limits, fence: Geofenc
 
 
 def _fenced(velocity_W: Vector, pose: DronePose, fence: Geofence) -> Vector:
-    """Convert a velocity from W to the heading frame, slowed down so that it does not lead out of the fence."""
+    """Convert a velocity from W to the heading frame, reduced so that the drone stays within the fence."""
     return turned_about_up(fence.limit_velocity(velocity_W, pose.p_W), -pose.yaw_rad)
 
 
@@ -278,7 +278,7 @@ class ManualFlight:
         self._client.take(flight.drone, partial(self._on_acquired, flight))
 
     def steer(self, page: Any, stick: Stick | None) -> FlightAnswer:
-        """Fly the page's drone by a stick; None: the dead-man key is released, so hover, or continue to a waypoint."""
+        """Fly the page's drone by a stick; None: the dead-man switch is open, so hover, or continue to a waypoint."""
         with self._lock:
             flight = self._flights.get(page)
             if flight is not None:
@@ -540,7 +540,7 @@ class _ReturningFormation:
 
 
 class ReturnFlights:
-    """Returns of the drones and formations of a run; thread-safe. `control` flies drones to waypoints."""
+    """The return flights of a run's drones and formations; thread-safe. `control` flies drones to waypoints."""
 
     def __init__(
         self,

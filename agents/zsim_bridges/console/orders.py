@@ -360,12 +360,12 @@ class OrderRequest(Struct, frozen=True, forbid_unknown_fields=True):
 
     op: Literal["emergency", "land", "hold", "acknowledge"]
     id: Name = ""
-    """Chosen by the page; carried out once per id. Empty: the order will not be repeated."""
+    """Chosen by the page; an order is carried out once per id. Empty: the order will not be repeated."""
     run: Name = ""
-    """The run for which the order was given; it is refused in any other. Empty: the run that is shown."""
+    """The run for which the order was given, which any other run refuses. Empty: the run that is shown."""
     drone: Name = ""
     cluster: Name = ""
-    """The target, a drone or a formation; all of them if both are empty."""
+    """The target is `drone` or `cluster`; if both are empty, all to which the operation applies."""
 
 
 @dataclass

@@ -24,8 +24,8 @@ OFFSET_M = np.array([-2.3, -3.9, 1.7])  # offset of a page's camera from its tar
 DISTANCE_MIN_M = float(np.linalg.norm(OFFSET_M))
 SLOPE_MIN = 0.05  # half the visible width per unit of distance on the narrowest page considered; hidden pages have none
 REACH_M = 0.6  # radius of a drone together with the name above it
-VISIBLE_MAX_M = 15.0  # distance beyond which a drone is too small, less than about 15 pixels, to count as in view
-MARGIN = 0.85  # share of half the page within which points count as in view
+VISIBLE_MAX_M = 15.0  # distance beyond which a drone is too small, less than about 15 pixels, to be seen
+MARGIN = 0.85  # share of half the page within which points are considered in view
 UP_W = np.array([0.0, 0.0, 1.0])
 DIRECTIONS = {  # directions from the target to the camera; not straight from above, where the up direction is undefined
     "reset": OFFSET_M / DISTANCE_MIN_M,
@@ -130,7 +130,7 @@ class PageCameras:
         self._lock = threading.Lock()
         self._pages: dict[int, _Page] = {}  # by viser's number
         self._points: Array = np.zeros((1, 3))
-        self._frusta: dict[int, _Frustum] = {}  # by viser's number of the page; only touched by the thread that draws
+        self._frusta: dict[int, _Frustum] = {}  # by viser's number of the page; used only by the drawing thread
         server.on_client_connect(self._on_connect)
         server.on_client_disconnect(self._on_disconnect)
 

@@ -147,7 +147,7 @@ def foreign_commanders(
 
     Args:
         controller: expected name of the controller's process; if no drone is flown by a process of that name, the
-            controller may have another name, so only consoles count as foreign.
+            controller may have another name, so only consoles are considered foreign.
         members: the formation's drones.
         commanders: commander of each drone.
         roles: roles of the known processes, by name.

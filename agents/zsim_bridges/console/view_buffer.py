@@ -66,7 +66,7 @@ class ReceivedLink(NamedTuple):
 
 
 class ViewBuffer:
-    """Keeps the newest message of each key until the next update, so that superseded ones are never decoded.
+    """Keeps the newest message on each key until the next update, so that superseded ones are never decoded.
 
     Callbacks run in Zenoh's threads.
 
