@@ -173,7 +173,8 @@ class Coordinator(ABC):
         else:
             blocks = former.is_waited_for and former.is_missed
         if not is_known and not strangers.allows("join"):
-            refusal = Refusal("newcomers", f"beyond {STRANGERS_MAX} at once", "must wait: one may join each second")
+            allowed = f"must be <= {STRANGERS_MAX} at once, then one each second"
+            refusal = Refusal("the number of new processes", f"above {STRANGERS_MAX}", allowed)
         elif not blocks and not changes.allows(counted):
             refusal = too_many(name)
         else:
