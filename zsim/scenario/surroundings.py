@@ -286,7 +286,7 @@ def nearest_points(sheet: Held, p_W: ArrayLike, far_m: ArrayLike) -> tuple[Array
 
 @kernel()
 def _find_nearest(held: Held, points: NDArray, distances: NDArray, positions: NDArray) -> None:
-    """Fill `positions` (P, 3) with the points nearest to `points`, and `distances` (P,), first limits, with theirs."""
+    """Fill `positions` (P, 3) with the points nearest to `points`; replace the limits in `distances` (P,)."""
     for k in range(points.shape[0]):
         nearest = nearest_point(held.content, (points[k, 0], points[k, 1], points[k, 2]), distances[k])
         distances[k] = nearest.distance
