@@ -1,1 +1,1 @@
-"""The fleet of all drones, advanced gate by gate: kernel, injected faults, messages of a gate. Imports vehicles."""
+"""The fleet of all drones, advanced gate by gate: kernel, faults, gate messages. Imports physics, sensors and vehicles."""
