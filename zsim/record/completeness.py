@@ -107,7 +107,7 @@ class _Numbered(Struct):
     seq: int
 
 
-UNREAD = -1  # in place of a sequence number that is not encoded as by zsim's encoder
+UNREAD = -1  # replaces a sequence number that is not encoded as zsim's encoder would
 _WIDTH = np.full(256, -1, dtype=np.int64)  # bytes after the first of a MessagePack unsigned integer, by its first byte
 _WIDTH[:0x80] = 0
 _WIDTH[[0xCC, 0xCD, 0xCE, 0xCF]] = 1, 2, 4, 8

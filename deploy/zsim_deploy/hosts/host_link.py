@@ -132,7 +132,8 @@ class HostLink:
         """
         async with self.channel(retry) as connection:
             try:
-                done = await asyncio.wait_for(connection.run(command, input=stdin, encoding=None), timeout_s)
+                async with asyncio.timeout(timeout_s):
+                    done = await connection.run(command, input=stdin, encoding=None)
             except TimeoutError as error:
                 description = what or repr(command[:60])
                 raise HostsError(f"{self.name}: no answer within {timeout_s:g} s ({description})") from error
@@ -189,7 +190,8 @@ class HostLink:
             connection.close()
         closed = asyncio.gather(*(each.wait_closed() for each in self._channels), return_exceptions=True)
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(closed, CLOSE_S)
+            async with asyncio.timeout(CLOSE_S):
+                await closed
 
 
 def _broken(name: str, error: Exception) -> HostsError:
@@ -226,7 +228,8 @@ class HostLinks:
 
         async def bounded(link: HostLink) -> Any:
             try:
-                return await asyncio.wait_for(work(link), within_s)
+                async with asyncio.timeout(within_s):
+                    return await work(link)
             except TimeoutError as error:
                 reason = f"not done within {within_s:g} s; is the link slow or the host busy?"
                 raise HostsError(f"{link.name}: {reason}") from error
@@ -312,7 +315,8 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
     part, moved = into.with_name(f"{into.name}.part"), asyncio.Event()
     try:
         async with link.channel() as connection:
-            sftp = await asyncio.wait_for(start_sftp(link.name, connection), OPEN_S)
+            async with asyncio.timeout(OPEN_S):
+                sftp = await start_sftp(link.name, connection)
             copy = asyncio.create_task(
                 sftp.get(
                     source.removeprefix("~/"), part, block_size=BLOCK_BYTES, progress_handler=lambda *_: moved.set()
@@ -397,14 +401,16 @@ async def connect(name: str, host: Host, base: Path) -> Connection:
             known_hosts = base / Path(host.known_hosts).expanduser()
             options["known_hosts"] = str(known_hosts)
         opening = asyncssh.connect(address, host.port, client_factory=lambda: client, **options)
-        return await asyncio.wait_for(opening, CONNECT_S)
+        async with asyncio.timeout(CONNECT_S):
+            return await opening
     except (asyncssh.Error, asyncssh.KeyImportError, OSError, ValueError, TimeoutError) as error:
         refused = client.refused
         if refused is None and isinstance(
             error, asyncssh.ConnectionLost | asyncssh.KeyExchangeFailed | ConnectionResetError
         ):  # perhaps no host key algorithm was agreed on: only those in known_hosts are offered
             with contextlib.suppress(asyncssh.Error, OSError, ValueError, TimeoutError):
-                key = await asyncio.wait_for(asyncssh.get_server_host_key(address, host.port), CONNECT_S)
+                async with asyncio.timeout(CONNECT_S):
+                    key = await asyncssh.get_server_host_key(address, host.port)
                 refused = (address, "", host.port, key) if key else None
         reason = _changed_key(name, host, known_hosts, *refused) if refused else ""
         raise HostsError(f"{name}: {reason or _reason(name, host, base, known_hosts, error)}") from error
