@@ -336,7 +336,7 @@ class Fleet:
     def set_ardrone(
         self, i: int, forward: float, left: float, up: float, yaw_left: float, hover: bool = False
     ) -> str | None:
-        """Fly by tilt, climb and yaw rate as fractions of their limits (-1 to 1), or hover; return why it is refused."""
+        """Fly by tilt, climb and yaw rate as shares of their limits (-1 to 1), or hover; return why it is refused."""
         return self._set(i, firmware.HOVER if hover else firmware.ARDRONE, (forward, left, up, yaw_left))
 
     def set_attitude(self, i: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float = 0.0) -> str | None:
