@@ -83,7 +83,7 @@ class Simulation:
     Args:
         scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
         seed, duration_s: replace those of the scenario.
-        set: replaces fields of the scenario by path, as in `{"environment.wind.gust_m_s": 1.0}`.
+        set: new values of the scenario's fields by path, as in `{"environment.wind.gust_m_s": 1.0}`.
         agents: "stock": the scenario's estimators and controllers; None: none; or a sequence of your own agents,
             classes or objects, which fly beside the stock ones, or alone with `stock=False`.
         law, estimator: classes that replace those of all clusters and drones.
@@ -127,7 +127,7 @@ class Simulation:
     def reset(self, seed: int | None = None, set: Mapping[str, Any] | None = None) -> Truth:
         """Start a new flight; return its initial state; raise RunError if the flight is recorded.
 
-        Agents given as objects get back the attributes that they had initially.
+        Agents given as objects get their initial attributes back.
 
         Args:
             seed: for this and later flights; None: as before.

@@ -1,8 +1,8 @@
 """Linear algebra for small matrices, bit-identical on every machine: every sum runs in index order.
 
 BLAS and LAPACK, on which numpy and scipy rely, order and fuse sums differently from processor to processor. Whatever
-affects the flight of a drone or the output of an agent uses these functions instead; up to tens of rows, they are as
-fast. Matrices are arrays of float64; a singular system gives results that are not finite.
+affects the flight of a drone or the output of an agent uses these functions instead; for up to tens of rows, they are
+as fast. Matrices are arrays of float64; a singular system gives results that are not finite.
 
     product     A B for A (m, k) and B (k, n) or (k,)
     solve       A^-1 B by elimination with partial pivoting

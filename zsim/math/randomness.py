@@ -1,6 +1,7 @@
 """Random streams and draws by name, and the normal and chi-square distributions, bit-identical on every machine.
 
-Adding a drone or sensor does not change the draws of the others. `zsim.math.elementary` explains why scipy is not used.
+Adding a drone or sensor does not change the draws of the others. scipy is not used, since its results differ between
+machines in their last bits (see `zsim.math.elementary`).
 """
 
 import hashlib

@@ -124,7 +124,7 @@ class Participant:
             self.publish("bye", self._membership.bye(self.now_ns, reason, failed))
 
     def tick(self) -> None:
-        """Rejoin if necessary, and publish health once per wall second; call this more often than that."""
+        """Rejoin if necessary, and publish health once per second of wall time; must be called more often."""
         if self.must_rejoin:
             self.must_rejoin = False
             self.join(is_rejoin=True)

@@ -292,7 +292,7 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
 
 
 def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
-    """Yield faults of drag coefficients so large that slow air would push as hard as the weight: a wrong unit.
+    """Yield faults of drag coefficients with which slow air would push as hard as the weight: a wrong unit is likely.
 
     A coefficient that is too small cannot be distinguished from an omitted one.
     """

@@ -433,7 +433,7 @@ class Processes(Spec, frozen=True, kw_only=True):
     """Roles, other than those of agents, that the run waits for; unset: none."""
 
     def gates(self, role: str) -> bool:
-        """Whether the run waits for the processes of a role that is not an agent's."""
+        """Return whether the run waits for the processes of a role that is not an agent's."""
         return self.gating is not UNSET and role in self.gating
 
 

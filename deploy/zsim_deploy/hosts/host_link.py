@@ -149,7 +149,7 @@ class HostLink:
     async def put_files(
         self, folder: str, files: Mapping[str, bytes], timeout_s: float = ANSWER_S, retry: bool = False
     ) -> None:
-        """Write files, given by path below a folder, readable by their owner alone.
+        """Write files, given by path below a folder, readable only by their owner.
 
         Raise HostsError if they cannot be written; if the link breaks, no file is written.
         """
@@ -204,9 +204,8 @@ class HostLinks:
     def __init__(self, inventory_file: InventoryFile, names: Iterable[str], loop: EventLoopThread) -> None:
         self._inventory_file = inventory_file
         self._loop = loop
-        self.by_name = {
-            name: self.to(name) for name in names
-        }  # replaced, never modified, because other threads read it
+        # replaced, never modified, because other threads read it
+        self.by_name = {name: self.to(name) for name in names}
 
     def to(self, name: str) -> HostLink:
         """Return a new link to a host of the inventory, without adding it."""
@@ -323,7 +322,7 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
                     source.removeprefix("~/"), part, block_size=BLOCK_BYTES, progress_handler=lambda *_: moved.set()
                 )
             )
-            copy.add_done_callback(lambda task: task.cancelled() or task.exception())  # or else asyncio reports it
+            copy.add_done_callback(lambda task: task.cancelled() or task.exception())  # otherwise asyncio reports it
             try:
                 while not (await asyncio.wait([copy], timeout=STALL_S))[0]:
                     if not moved.is_set():
@@ -356,7 +355,7 @@ async def start_sftp(name: str, connection: Connection) -> asyncssh.SFTPClient:
 
 
 def shell_word(path: str) -> str:
-    """Quote a path as one word for a shell; a leading ~/ still stands for the home of the user there."""
+    """Quote a path as one word for a host's shell, which still expands a leading ~/ to the user's home folder."""
     return f"~/{shlex.quote(path[2:])}" if path.startswith("~/") else shlex.quote(path)
 
 
@@ -420,7 +419,7 @@ async def connect(name: str, host: Host, base: Path) -> Connection:
 def _changed_key(
     name: str, host: Host, known_hosts: Path, searched_name: str, address: str, port: int, host_key: asyncssh.SSHKey
 ) -> str:
-    """Return a text on a host key that differs from the known one; empty if it does not, or none is known."""
+    """Return a text about a host key that differs from the known one; empty if it does not, or none is known."""
     path = str(known_hosts.expanduser())
     try:
         keys = asyncssh.match_known_hosts(path, searched_name, address, None if port == SSH_PORT else port)[0]

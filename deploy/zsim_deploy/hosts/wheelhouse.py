@@ -2,7 +2,7 @@
 
 CACHE/wheels/*.whl           wheels of other projects, for all hosts
 CACHE/build/*.whl            wheels of this project's build requirements, for this machine
-CACHE/houses/KEY.json        names of the wheels for one kind of host and its extras; KEY is a hash of these
+CACHE/houses/KEY.json        names of the wheels for a kind of host; KEY is a hash of its target, extras and versions
 CACHE/zsim/KEY/zsim-*.whl    wheel of this project; KEY is a hash of its sources
 """
 
@@ -211,7 +211,7 @@ def requirements(project: Path) -> list[str]:
 
 
 def requirement(installed: importlib.metadata.Distribution) -> str:
-    """Return the requirement by which pip finds an installed distribution again: its origin, or its version."""
+    """Return the requirement with which pip finds an installed distribution again: its origin, or its version."""
     origin = json.loads(installed.read_text("direct_url.json") or "{}")  # PEP 610
     if "vcs_info" in origin:
         return f"{PROJECT} @ {origin['vcs_info']['vcs']}+{origin['url']}@{origin['vcs_info']['commit_id']}"

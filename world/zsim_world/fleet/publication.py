@@ -47,7 +47,7 @@ write = inlined(framing.write)
 
 
 class PublicationBuffers(NamedTuple):
-    """Room for M encoded messages."""
+    """Buffers for M encoded messages."""
 
     columns: NDArray[np.int64]  # (3, M): WHICH, STAMPS, ENDS
     first: NDArray[np.int64]  # (N + 1,), where the messages of each drone begin
@@ -115,14 +115,14 @@ class GatePublication:
         self.counts = np.zeros((fleet.count, len(self.table) // fleet.count), dtype=np.int64)
         rotors = np.array(fleet.rotors, dtype=np.int64)
         own_messages = np.array([0 if i in fleet.external else OWN_MESSAGES for i in range(fleet.count)])
-        self._first = int(np.argmax(own_messages))  # a drone whose status numbers the gates
+        self._first = int(np.argmax(own_messages))  # a drone whose status has the number of the gate as `seq`
         self._own_count = int(own_messages.sum())
         sigmas_m = np.array(fleet.gps_sigma_m)
         self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, self.counts, rotors, own_messages)
         self._known: dict[str | None, int] = {None: COMMANDER}
         self._words = framing.text_table((*firmware.MODES, None))
         payloads = self._payloads()
-        self._user_room = 2 * len(payloads.data)  # bytes of messages that are encoded in Python
+        self._user_room = 2 * len(payloads.data)  # bytes reserved for messages encoded in Python
         self._make_room(16 * fleet.count)
         # Load or compile the functions that the first gate needs, without counting messages.
         uncounted = self._fleetwide._replace(counts=self.counts.copy())

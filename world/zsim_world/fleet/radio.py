@@ -1,4 +1,4 @@
-"""Which drones receive which others at a gate, from the scenario's topology and radio, and the true positions."""
+"""Determines which drones hear which others at a gate, from the scenario's topology, its radio and true positions."""
 
 from collections.abc import Iterable
 
@@ -25,7 +25,7 @@ class RadioChannel:
         scene: the obstacles and surfaces that block lines of sight.
 
     Raises:
-        ValueError: the scenario has neither a radio nor a topology.
+        ValueError: `scenario.radio_of_agents` is None.
     """
 
     def __init__(self, scenario: Scenario, scene: Scene) -> None:
