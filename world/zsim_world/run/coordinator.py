@@ -43,7 +43,7 @@ class Coordinator(ABC):
 
     Attributes:
         needs_participants: whether the loss of a participant affects the run; False for a replay.
-        refused_queries: further keys, besides `world/control`, on which requests are refused.
+        refused_queries: keys other than `world/control` on which requests are received, but refused.
         external: names of the drones whose drivers publish sensors, truth and status.
         unpaced: names of the processes that step when a driver publishes, not at every gate.
         is_launched: whether a launcher started the run; otherwise users start each process.
