@@ -9,6 +9,7 @@ scenario:
 import math
 import os
 import sys
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import msgpack
@@ -20,6 +21,7 @@ _ = len(WORDS) in (1, 4) or sys.exit("usage: python examples/external_drone.py [
 DRONE, PLACE = WORDS[0], [float(x) for x in WORDS[1:]] or [0.0, 0.0, 0.05]
 ME, G_M_S2, LAG_S, TAKEOFF_M, CLIMB_M_S = f"driver.{DRONE}", 9.80665, 0.3, 1.0, 0.7
 HOVER_S, LAND_S = 0.5, 2.0  # time without a command before the drone hovers; further time before it lands
+SILENCE_S = 10.0  # wall time; even while simulated time stands still, the world publishes its clock once a second
 
 
 class Aircraft:
@@ -91,10 +93,17 @@ with zenoh.open(config) as session:
         refusal = "" if known else f"op is {op!r}; must be arm, disarm or kill"
         query.reply(f"zsim/drone/{DRONE}/driver", msgpack.packb({"ok": known, "error": refusal}))
 
-    clocks = session.declare_subscriber("zsim/clock", zenoh.handlers.FifoChannel(10_000))
+    def next_clock() -> dict[str, Any]:
+        try:
+            return msgpack.unpackb(clocks.get(timeout=SILENCE_S).payload.to_bytes())
+        except Empty:
+            sys.exit(f"{ME}: the world on {ENDPOINT} has been silent for {SILENCE_S:g} s")
+
+    clocks: SimpleQueue[zenoh.Sample] = SimpleQueue()
+    kept = session.declare_subscriber("zsim/clock", zenoh.handlers.Callback(clocks.put, indirect=False))
     accepted = session.declare_subscriber(f"zsim/drone/{DRONE}/accepted/*", zenoh.handlers.FifoChannel(10_000))
     while (info := get("world/info")) is None:
-        clocks.recv()  # retry at the next clock message, which comes once a second while the world waits
+        next_clock()  # retry at the next clock message, which comes once a second while the world waits
     place = next(drone for drone in info["drones"] if drone["name"] == DRONE)
     truth, status = get(f"drone/{DRONE}/truth"), get(f"drone/{DRONE}/sensor/status")  # left by an earlier driver
     own = truth or {"position_m": PLACE, "orientation_wxyz": [1, 0, 0, 0]}
@@ -105,7 +114,7 @@ with zenoh.open(config) as session:
     run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
     put(f"process/{ME}/join", t_ns=0, **run, role="driver", host="here", pid=os.getpid(), period_ns=0)
     last_ns, link_ns, east_m = -1, -1, 111_319.49 * math.cos(math.radians(info["origin"]["latitude_deg"]))
-    while (clock := msgpack.unpackb(clocks.recv().payload.to_bytes()))["state"] != "stopped":
+    while (clock := next_clock())["state"] != "stopped":
         t_ns = clock["t_ns"]
         while (sample := accepted.try_recv()) is not None:
             kind, command = str(sample.key_expr).rsplit("/", 1)[1], msgpack.unpackb(sample.payload.to_bytes())
