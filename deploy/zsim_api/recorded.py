@@ -218,10 +218,10 @@ class Run:
     ) -> "DataFrame":
         """Return error statistics as in the report's tables, with a row for each variable and its unit.
 
-        For formations, by cluster and variable, over the part of the window in which it was engaged: `est_…` is
-        estimate − desired, as the controller saw it, `true_…` is truth − desired. For estimates, by drone and variable:
-        `std`, `rms` and `mean` of estimate − truth, and `inside`, the share of errors within two stated standard
-        deviations. NaN where the window has no such samples.
+        For formations, by cluster and variable, over the part of the window in which the cluster was engaged: `est_…`
+        is estimate − desired, as the controller saw it, `true_…` is truth − desired. For estimates, by drone and
+        variable: `std`, `rms` and `mean` of estimate − truth, and `inside`, the share of errors within two stated
+        standard deviations. NaN where the window has no such samples.
 
         Args:
             window: start and end [s]; None: the report's, `run.summary.window_s`.
@@ -419,7 +419,7 @@ class Run:
         return self._tables[key]
 
     def _of_all_drones(self, key: str) -> list[str]:
-        """Return the keys of all drones that correspond to a drone's key; for any other key, that key alone."""
+        """Return the recorded keys of all drones that correspond to a drone's key; for another key, that key alone."""
         kind, _, leaf = keys.parts(key)
         corresponding = [f"drone/{drone}/{leaf}" for drone in self.drones] if kind == "drone" else [key]
         return [each for each in corresponding if each in self.keys]
@@ -464,14 +464,14 @@ class Run:
         return self._known("cluster", self.clusters[0] if name is None else name, self.clusters)
 
     def _untrusted(self, cluster: str) -> str:
-        """Return the end of an error that names the space of a cluster; empty if the space was imported."""
+        """Return the end of an error about a cluster whose space was not imported, naming it; empty otherwise."""
         scenario = None if self._trust else self._assessment[0].scenario
         own = cluster_of(scenario, cluster)
         names = [each.space for each in (own, *own.groups) if each.space and ":" in each.space] if own else []
         return f"; its space {names[0]} is imported only by zsim.load(…, trust=True)" if names else ""
 
     def judged_formation(self, cluster: str | None = None) -> Formation:
-        """Return the content of `formation` as arrays; errors as there."""
+        """Return the content of `formation` as arrays; raise the same errors."""
         name = self._cluster(cluster)
         formation = next((each for each in self._assessment[1] if each.name == name), None)
         if formation is None:
@@ -490,7 +490,7 @@ def _checked(window: Window) -> Window:
 
 
 def _moments(errors: EstimateErrors, window: Window) -> dict[str, tuple[Any, ...]]:
-    """Return the unit, standard deviation, RMS, mean and share inside for each error within a window."""
+    """Return unit, standard deviation, RMS, mean and share within two stated σ of each error in a window."""
     rows = (errors.t_s >= window[0]) & (errors.t_s <= window[1])
     inside = errors.share_inside(rows) if rows.any() else [None] * len(ERROR_COLUMNS)
     moments = {}
@@ -568,7 +568,7 @@ def read_tables(record: Path, requested_keys: Collection[str]) -> dict[str, Tabl
 
 
 def frame(table: Mapping[str, NDArray[Any]], index: Sequence[str] = (INDEX,)) -> "DataFrame":
-    """Return a table as a pandas DataFrame with one or more columns as its index; without pandas a dict of arrays."""
+    """Return a table as a pandas DataFrame with one or more columns as its index; without pandas, a dict of arrays."""
     try:
         from pandas import DataFrame
     except ModuleNotFoundError:

@@ -1,6 +1,6 @@
-"""The folder of a run: a new one, or one without files that a run would replace or be confused with.
+"""Prepares and locks the folder of a run, which must be new or without files of another run or of other programs.
 
-Beside the journal of the world, it records how the run was launched, so that an interrupted run can be continued.
+Beside the world's journal, a file records how the run was launched, so that an interrupted run can be continued.
 """
 
 import json
@@ -151,8 +151,8 @@ class Launch(msgspec.Struct, frozen=True):
     insecure: bool = False
     listen: str | None = None
     modules: tuple[str, ...] = ()  # folders searched for modules that the scenario names
-    agents: tuple[tuple[str, ...], ...] = ()  # the user's agents, as words of `AgentSpec`
-    changed: tuple[str, ...] = ()  # overrides `a.b.c=value` of the scenario's file
+    agents: tuple[tuple[str, ...], ...] = ()  # the user's agents, as returned by `AgentSpec.arguments`
+    changed: tuple[str, ...] = ()  # overrides `a.b.c=value` applied to the scenario's file
 
 
 def new_launch(**how: Any) -> Launch:
@@ -183,7 +183,7 @@ def prepare(
 
 
 def forget_launch(folder: Path) -> None:
-    """Remove the launch of a run that did not fly at all, or flew to its end."""
+    """Remove the launch file of a run that either did not fly at all or flew to its end."""
     with suppress(OSError):
         (folder / JOURNAL / LAUNCH).unlink(missing_ok=True)
         (folder / JOURNAL).rmdir()

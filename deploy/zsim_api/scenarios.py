@@ -1,4 +1,4 @@
-"""A scenario in Python: the document as in YAML, changed by path or with classes, and checked by the same rules."""
+"""A scenario in Python: the same document as in YAML, changed by path, with classes as values, and the same checks."""
 
 import copy
 import json
@@ -29,14 +29,14 @@ class Scenario:
     It is checked as a whole when it is flown, or by `resolved`.
 
     Args:
-        fields: top-level fields, in maps and lists as in YAML; docs/scenario.md lists them all.
+        fields: top-level fields, with maps and lists as in YAML; docs/scenario.md lists them all.
     """
 
     def __init__(self, **fields: Any) -> None:
         self._document: dict[str, Any] = copy.deepcopy(fields)
         self.source = "scenario"  # its origin, as named in error messages
         self.folders: tuple[Path, ...] = (Path.cwd(),)  # folders searched for the modules that it names
-        self.changes: tuple[str, ...] | None = None  # overrides `a.b.c=value` of its file; None without a file
+        self.changes: tuple[str, ...] | None = None  # overrides `a.b.c=value` applied to its file; None without one
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -47,7 +47,7 @@ class Scenario:
         return scenario
 
     def with_(self, set: Mapping[str, Any] = {}, /, **fields: Any) -> Self:
-        """Return the scenario with other values.
+        """Return the scenario with changed values.
 
         Args:
             set: values by path, `{"drones.drone2.mass_kg": 0.5}`; where a class is named, the class itself is accepted.
@@ -108,7 +108,7 @@ class Scenario:
                 shutil.copy(file, folder)
 
     def __getitem__(self, path: str) -> Any:
-        """Return the value at a path as it is flown, in maps and lists as in YAML: `s["environment.wind.gust_m_s"]`.
+        """Return the value at a path as it is flown, with maps and lists as in YAML: `s["environment.wind.gust_m_s"]`.
 
         Raises:
             ScenarioError: the path does not exist, or the scenario has faults.
@@ -166,7 +166,7 @@ class Scenario:
 
 
 def _by_path(values: Any, path: str = "") -> dict[str, Any]:
-    """Return all values by path; a list entry with a name is found under that name."""
+    """Return all values by path; a list entry is found under its name, and omitted if it has none."""
     result = {path: values} if path else {}
     parts: dict[str, Any] = values if isinstance(values, dict) else {}
     if isinstance(values, list):

@@ -83,7 +83,7 @@ class Simulation:
     Args:
         scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
         seed, duration_s: replace those of the scenario.
-        set: replaces fields of the scenario by path, as in `{"environment.wind.gust_m_s": 1.0}`.
+        set: new values of the scenario's fields by path, as in `{"environment.wind.gust_m_s": 1.0}`.
         agents: "stock": the scenario's estimators and controllers; None: none; or a sequence of your own agents,
             classes or objects, which fly beside the stock ones, or alone with `stock=False`.
         law, estimator: classes that replace those of all clusters and drones.

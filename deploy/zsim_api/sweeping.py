@@ -86,13 +86,13 @@ def sweep(
     Returns:
         A frame indexed by run number: `seed`, the values by path, `failure` (why the run did not end well, NaN if it
         did), `metrics.NAME`, errors, and the other columns of docs/sweep.md. Missing texts and numbers are NaN, missing
-        flags NA. A class appears by its name, a second one of the same name as `Law-2`. `attrs["folder"]` is the folder
-        of the sweep, `attrs["summary"]` the content of summary.json of `zsim report`: means and intervals of each
-        combination.
+        flags NA. A class appears under its name, a second one of the same name as `Law-2`. `attrs["folder"]` is the
+        folder of the sweep, `attrs["summary"]` the content of summary.json of `zsim report`: means and intervals of
+        each combination.
 
     Raises:
         ScenarioError: with one line for every fault in the values and in the scenarios.
-        RunError: the folder holds something else, workers cannot start, or pandas is not installed.
+        RunError: the folder contains something else, workers cannot start, or pandas is not installed.
     """
     with what_is_missing():
         import_module("pandas")  # before anything is flown

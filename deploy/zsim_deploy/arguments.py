@@ -315,7 +315,7 @@ several_options = option_group(
     lambda connect, federation, wait, *more: WorldAccess(connect, federation, wait, None, *more),
     {name: each for name, each in _PARTICIPANT.items() if name != "tls"},
 )
-"""Like `participant_options`, for a process that hosts several agents: no certificate, which is for a single name."""
+"""Like `participant_options`, for a process that hosts several agents: no `--tls`, as a certificate is for one name."""
 listener_options = option_group(
     "who",
     identity,

@@ -1,7 +1,7 @@
 """The certificate authority of a federation: certificates of its processes on its hosts, and their access rights.
 
 certs/ca.pem, certs/ca.key                             the authority; the key stays on the machine where it was made
-certs/HOST/PROCESS/ca.pem, certificate.pem, key.pem    files of one process on one host; the folder is for --tls
+certs/HOST/PROCESS/ca.pem, certificate.pem, key.pem    files of one process on one host; --tls takes their folder
 certs/HOST/PROCESS.access.json                         access control of a listening process
 
 Zenoh enforces access control at the listening process (the world or a router), by the common name in the peer's
@@ -36,9 +36,8 @@ from zsim_deploy.inventory import InventoryFile
 
 AUTHORITY_DAYS = 1825  # lifetime of an authority, 5 years; its key never leaves the machine where it was made
 AUTHORITY_KEY = "ca.key"
-BACKDATE = timedelta(
-    days=1
-)  # certificates are back-dated by this, because clocks of hosts in the field may be hours off
+# Certificates are back-dated by this, because clocks of hosts in the field may be hours off.
+BACKDATE = timedelta(days=1)
 EXPIRED = "expired on"  # start of a fault text; a date follows
 OPERATORS = "operators"  # folder, in place of HOST, for operators without a host in the inventory
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
@@ -403,7 +402,7 @@ _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("ingress", ("liveliness_query", "declare_liveliness_subscriber"), "watches"),
     ("egress", ("liveliness_token",), "watches"),
 )
-# Declarations may go to every named process, because it sends nothing without them; they have no payload.
+# Declarations may go to every named process, which would otherwise send nothing; they have no payload.
 _DECLARATIONS = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
 _MESSAGES = (*_DECLARATIONS, "put", "delete", "query", "reply", "liveliness_token")
 ANYONE = "anyone"  # any peer with a certificate of the authority: a subject without conditions matches all

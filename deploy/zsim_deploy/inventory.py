@@ -43,9 +43,8 @@ MODULE = (SAFE_PATH, "-m", "zsim_deploy.cli")  # arguments for the Python interp
 EXTRAS_BY_NAME = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # extras by process name, in placement order
 CAMERA_ROLES = ("camera", "detector")  # roles that a run waits for only if the scenario names them
 COMMANDS = {RECORDER: "record", "detector": "detect"}  # commands that are not named after their role
-EXTRAS_BY_ROLE = {
-    f"{name}.": ROLES[name].extra for name in (*AGENTS, *CAMERA_ROLES)
-}  # extras by prefix of the process name
+# extras by prefix of the process name
+EXTRAS_BY_ROLE = {f"{name}.": ROLES[name].extra for name in (*AGENTS, *CAMERA_ROLES)}
 MODULES = {  # module imported to check that an extra is installed; "": the installation without extras
     "": "zsim.transport.session",
     "agents": "zsim_agents.estimation.estimator",
@@ -109,7 +108,7 @@ class Inventory(Spec, frozen=True, kw_only=True):
 
 
 class InventoryFile(NamedTuple):
-    """An inventory read from disk; its relative paths start at `folder`."""
+    """An inventory read from disk; its relative paths refer to `folder`."""
 
     inventory: Inventory
     folder: Path
@@ -292,7 +291,7 @@ class PlannedProcess(NamedTuple):
 
     @property
     def is_restarted(self) -> bool:
-        """Whether its service restarts it; never the world's, because a world run as a service keeps no journal."""
+        """Whether its service restarts it; false for the world, because a world run as a service keeps no journal."""
         return self.on_death == "restart" and self.name != WORLD
 
     @property
@@ -428,8 +427,8 @@ def extras(names: Sequence[str]) -> list[str]:
 def needed_extras(inventory: Inventory, additional: Iterable[str] = ()) -> dict[str, frozenset[str]]:
     """Return the extras that each host needs, including `additional`.
 
-    A pattern counts for every role that it can match, because the scenario is unknown here. Routers and the user's own
-    programs need no extra.
+    A pattern is assumed to match every role that it can, because the scenario is unknown here. Routers and the user's
+    own programs need no extra.
     """
     extras_by_host: dict[str, set[str]] = {name: set(additional) for name in inventory.hosts}
     for process, host in spread(inventory.roles, EXTRAS_BY_NAME).items():

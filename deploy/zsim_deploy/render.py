@@ -34,8 +34,8 @@ Rendered = dict[str, str]
 """Text of each file, by path in the output folder."""
 TEMPLATES = Path(__file__).with_name("templates")
 
-STATE = "/var/lib/zsim"  # folder that StateDirectory=zsim stands for
-CACHE = "/var/cache/zsim"  # folder that CacheDirectory=zsim stands for
+STATE = "/var/lib/zsim"  # folder that StateDirectory=zsim creates
+CACHE = "/var/cache/zsim"  # folder that CacheDirectory=zsim creates
 PATH_MAX = 4000  # maximum length of a folder's path, bytes; Linux allows 4095, file names included
 STOP_S = 15  # time to stop before SIGKILL; the world waits 5 s for bye messages, and the recorder may wait for its disk
 BASE = "python:3.11-slim"  # base image, with the oldest Python that zsim runs on
@@ -112,7 +112,7 @@ def _absolute(host: Host, path: str) -> str:
 
 
 def _service(scenario: Scenario, process: PlannedProcess, host: Host, local_processes: Sequence[PlannedProcess]) -> str:
-    """Return the unit of a process; units stop in reverse order: the world first, which ends the run, routers last."""
+    """Return the unit of a process; units stop in reverse of their start order: the world first, to end the run."""
     rank = {ROUTER: 0, WORLD: 2}
     earlier = [each.unit for each in local_processes if rank.get(each.role, 1) < rank.get(process.role, 1)]
     folder = _absolute(host, host.folder)
@@ -383,7 +383,7 @@ _Dumper.add_representer(str, _Dumper.represent_text)
 def write(out: Path, target: str, texts: Mapping[str, str], force: bool = False) -> list[str]:
     """Write texts into a folder; return the removed files, which an earlier rendering for this target had written.
 
-    A list beside the files has their digests, in the format of `sha256sum`, so that a later rendering for the same
+    A list beside the files contains their digests, in the format of `sha256sum`, so that a later rendering for the same
     target can remove the files of an earlier one. Raises RunError if a file cannot be written, a path leads out of the
     folder, a file to be removed was changed since its rendering, or, without `force`, a file to be replaced was not
     rendered or was changed since.

@@ -74,6 +74,10 @@ def _flaws(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
     """Yield the path and type of each value of a state that cannot be packed."""
     if isinstance(value, dict):
         for name, each in value.items():
+            if not path and _is_too_deep(each):  # perhaps it contains itself
+                yield str(name), "a map or list nested too deeply"
+                continue
+            yield from _flaws(name, f"a key of {path}")
             yield from _flaws(each, f"{path}.{name}" if path else str(name))
     elif isinstance(value, list | tuple):
         for index, each in enumerate(value):
@@ -81,9 +85,21 @@ def _flaws(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
     else:
         try:
             _ENCODER.encode(value)
+        except OverflowError:
+            yield path, "an int of more than 64 bits"
         except (TypeError, *REFUSALS):
             kind = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
             yield path, kind
+
+
+def _is_too_deep(value: Any) -> bool:
+    try:
+        _ENCODER.encode(value)
+    except RecursionError:
+        return True
+    except (TypeError, *REFUSALS):
+        return False
+    return False
 
 
 def _packed(value: Any) -> Any:

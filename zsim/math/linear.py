@@ -1,10 +1,10 @@
-"""Linear algebra of small matrices with the same bits everywhere: every sum runs in the order of its index.
+"""Linear algebra for small matrices, bit-identical on every machine: every sum runs in index order.
 
 BLAS and LAPACK, on which numpy and scipy rely, order and fuse sums differently from processor to processor. Whatever
-affects the flight of a drone or the output of an agent uses these functions instead; up to tens of rows, they are as
-fast. Matrices are arrays of float64; a singular system gives results that are not finite.
+affects the flight of a drone or the output of an agent uses these functions instead; for up to tens of rows, they are
+as fast. Matrices are arrays of float64; a singular system gives results that are not finite.
 
-    product     A B of (m, k) and (k, n), or of (m, k) and (k,)
+    product     A B for A (m, k) and B (k, n) or (k,)
     solve       A^-1 B by elimination with partial pivoting
     solve_banded        the same, for a matrix with few diagonals
     eigen       eigenvalues, ascending, and eigenvectors of a symmetric matrix (Jacobi)
@@ -87,7 +87,7 @@ def _own(A: ArrayLike) -> Array:
 
 @deferred()
 def product_with(A: Array, B: Array) -> Array:
-    """Return A B of contiguous arrays (m, k) and (k, n); for compiled code."""
+    """Return A B for contiguous arrays (m, k) and (k, n); for compiled code."""
     m, n = A.shape[0], B.shape[1]
     C = np.zeros((m, n))
     for i in range(m):
@@ -100,7 +100,7 @@ def product_with(A: Array, B: Array) -> Array:
 
 @deferred()
 def _solved(A: Array, B: Array) -> Array:
-    """Return A^-1 B; both are overwritten."""
+    """Return A^-1 B; A and B are overwritten."""
     n, m = B.shape
     for k in range(n):
         best = k
@@ -130,7 +130,7 @@ def _solved(A: Array, B: Array) -> Array:
 
 @deferred()
 def _banded_solved(A: Array, below: int, B: Array) -> Array:
-    """Return A^-1 B; both are overwritten."""
+    """Return A^-1 B; A and B are overwritten."""
     n, m = B.shape
     right = A.shape[1] - below  # columns of a row from the diagonal on
     for k in range(n):

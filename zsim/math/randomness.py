@@ -1,6 +1,7 @@
-"""Random streams and single draws by name, and the normal and chi-square distributions: the same bits everywhere.
+"""Random streams and draws by name, and the normal and chi-square distributions, bit-identical on every machine.
 
-Adding a drone or sensor does not change the draws of others. `zsim.math.elementary` explains why scipy is not used.
+Adding a drone or sensor does not change the draws of the others. scipy is not used, since its results differ between
+machines in their last bits (see `zsim.math.elementary`).
 """
 
 import hashlib
@@ -55,7 +56,7 @@ def normal_probability(x: float) -> float:
 
 
 def normal_quantile(probability: float) -> float:
-    """Return the value below which a standard normal variable lies with a probability in [0, 1]."""
+    """Return the value below which a standard normal variable lies with the given probability, in [0, 1]."""
     if not 0.0 < probability < 1.0:
         return -math.inf if probability == 0.0 else math.inf if probability == 1.0 else math.nan
     return _bisected(normal_probability, probability, -_SIGMAS_MAX, _SIGMAS_MAX)
@@ -83,7 +84,7 @@ def chi_square_probability(x: float, dof: int) -> float:
 
 
 def chi_square_quantile(probability: float, dof: int) -> float:
-    """Return the value below which a chi-square variable lies with a probability in [0, 1)."""
+    """Return the value below which a chi-square variable lies with the given probability, in [0, 1)."""
     return _bisected(lambda x: chi_square_probability(x, dof), probability, 0.0, 700.0)
 
 

@@ -1,7 +1,7 @@
-"""Vectors and quaternions as tuples of floats, for compiled code: no allocation, a fixed order of operations.
+"""Vectors, quaternions and matrices as tuples of floats, for compiled code: no allocation, fixed order of operations.
 
-A vector is (x, y, z). A quaternion is Hamilton, (w, x, y, z), and turns body components into world components, as does
-a rotation matrix, which is a tuple of rows.
+A vector is (x, y, z). A quaternion, (w, x, y, z), follows Hamilton's convention and maps body components to world
+components, as does a rotation matrix, which is a tuple of rows.
 """
 
 import math
@@ -204,7 +204,7 @@ def composed(A: Matrix, B: Matrix) -> Matrix:
 
 @portable
 def position_between(s: float, dt: float, p0: Vector, v0: Vector, p1: Vector, v1: Vector) -> tuple[float, float, float]:
-    """Return the position at fraction s of an interval dt [s], on the Hermite cubic with these ends and velocities."""
+    """Return the position at fraction s of an interval dt [s], on the Hermite cubic with these end points."""
     a, b = s * s * (3.0 - 2.0 * s), dt * s * (1.0 - s) * (1.0 - s)
     c = dt * s * s * (s - 1.0)
     x = p0[0] + a * (p1[0] - p0[0]) + b * v0[0] + c * v1[0]

@@ -32,7 +32,7 @@ class GateGap(Struct, frozen=True):
 
 
 class GateCount:
-    """Counts the gates of a run by its clock messages, in the order in which the world published them.
+    """Counts the gates of a run by its clock messages, added in the order in which the world published them.
 
     Args:
         previous: clock message after which counting begins; None for the start of the run.
@@ -69,7 +69,7 @@ class Completeness(Struct, frozen=True):
     gates: int = 0  # gates in the record
     gaps: tuple[GateGap, ...] = ()  # missing gates
     messages_missing: int = 0  # missing messages of the world by sequence number, including those of missing gates
-    ended: bool = True  # whether the record has the end of the run
+    ended: bool = True  # whether the record contains the end of the run
     closed: bool = True  # whether its writer has closed it
     last_ns: int = 0  # time of the last gate
     damaged: tuple[str, ...] = ()  # unreadable parts, with their positions
@@ -107,7 +107,7 @@ class _Numbered(Struct):
     seq: int
 
 
-UNREAD = -1  # in place of a sequence number that is not encoded as by zsim's encoder
+UNREAD = -1  # replaces a sequence number that is not encoded as zsim's encoder would
 _WIDTH = np.full(256, -1, dtype=np.int64)  # bytes after the first of a MessagePack unsigned integer, by its first byte
 _WIDTH[:0x80] = 0
 _WIDTH[[0xCC, 0xCD, 0xCE, 0xCF]] = 1, 2, 4, 8

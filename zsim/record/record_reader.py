@@ -94,8 +94,8 @@ class RecordReader:
         Args:
             keys: exact keys; chunks without any of them are not decompressed.
             by_time: whether to sort by simulated time, at equal times in the order written; otherwise, all are in the
-                order written. Sorting holds in memory chunks that overlap in time, and single stragglers.
-            from_ns: chunks with only older messages are skipped; a chunk spans a quarter of a wall second.
+                order written. Sorting keeps in memory only chunks that overlap in time, and stragglers.
+            from_ns: chunks with only older messages are skipped; a chunk spans about 0.25 s of wall time.
         """
         wanted = {number: key for number, key in self._keys.items() if keys is None or key in keys}
         candidates = (chunk for chunk in self._chunks if chunk.last_ns >= from_ns)
@@ -214,7 +214,7 @@ class RecordReader:
             self._unreadable_from = end
 
     def _scan(self) -> Iterator[_Chunk]:
-        channel_sets: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
+        channel_sets: dict[frozenset[int], frozenset[int]] = {}  # most chunks contain the same channels
         spans = self._record_spans()
         chunk_groups = [group for group in layout.groups(self._source, spans) if group.place.opcode == Opcode.CHUNK]
         for _ in spans:  # read the channels in the summary
@@ -253,7 +253,7 @@ class RecordReader:
                 yield Recorded(wanted[number], content[at + payload : at + head + length], t_ns, wall_ns)
 
     def _by_time(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
-        """Yield messages by time, holding in memory only the chunks that overlap in time, and stragglers."""
+        """Yield messages by time, keeping in memory only chunks that overlap in time, and stragglers."""
         stragglers, floors = self._stragglers(chunks, wanted)
         starts = [floors.get(number, chunk.first_ns) for number, chunk in enumerate(chunks)]
         for number in sorted(range(len(chunks)), key=starts.__getitem__):
@@ -270,8 +270,8 @@ class RecordReader:
     def _stragglers(self, chunks: list[_Chunk], wanted: dict[int, str]) -> tuple[list[_Straggler], dict[int, int]]:
         """Return messages stamped long before the rest of their chunk, and by chunk the first time of the rest [ns].
 
-        A program that does not stamp its messages puts one of time 0 into every chunk. If chunks were ordered by their
-        oldest messages, all would be read and held at the beginning.
+        A program that does not stamp its messages puts one at time 0 into every chunk. If chunks were ordered by their
+        oldest messages, all would be read first and kept in memory.
         """
         strays: list[_Straggler] = []
         floors: dict[int, int] = {}

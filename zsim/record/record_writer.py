@@ -78,7 +78,7 @@ class RecordWriter:
             raise
 
     def _continue_file(self) -> None:
-        """Read the channels and schemas of the complete part of the file."""
+        """Truncate the file after its last complete chunk; read its channels, schemas and message counts."""
         _truncate_file(self._file, self.path)
         counts: Counter[int] = Counter()
         self._end = self._file.seek(0, 2)
@@ -102,7 +102,7 @@ class RecordWriter:
         Args:
             key: key without the federation's prefix.
             payload: payload as on the wire.
-            encoding: Zenoh's, e.g. `application/msgpack;Truth`; a key's first encoding applies to all its messages.
+            encoding: Zenoh encoding, e.g. `application/msgpack;Truth`; a key's first one applies to all its messages.
             t_ns: simulated time.
             wall_ns: wall clock of the recorder.
         """
@@ -421,7 +421,7 @@ def repair(path: str | Path) -> bool:
 
 
 def _truncate_file(file: FileIO, path: Path) -> None:
-    """Truncate a record after its last complete chunk, or else its header, so that it can be continued from there.
+    """Truncate a record after its last complete chunk, or else after its header, so that it can be continued.
 
     Raises RecordError if the file is not a record, and OSError if it cannot be written.
     """
@@ -448,7 +448,7 @@ def _truncate_file(file: FileIO, path: Path) -> None:
 
 
 def _finish(file: FileIO) -> None:
-    """Write summary and footer to the end of a file open for unbuffered reading and writing; raise OSError if full."""
+    """Append the data end, summary and footer to a file open for unbuffered I/O; raise OSError if the disk is full."""
     with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
         summary = _summary(source)
         data_end = layout.packed(DataEnd(layout.crc_until(source, len(source))))

@@ -47,7 +47,7 @@ class Agent(ABC):
     """Base class of all agents in the lockstep."""
 
     name: str  # process name `role.thing`, e.g. `estimator.drone1`
-    period_ns: int  # interval of its steps and dones; a multiple of the gate interval
+    period_ns: int  # interval of its steps and done messages; a multiple of the gate interval
     reads: tuple[str, ...]  # key expressions to which it subscribes
     gate_keys: tuple[str, ...]  # gate t closes once each of these keys has had a message stamped t, e.g. sensor/status
     # drones of which it reads all sensors: it waits for every message that their status counts
@@ -163,7 +163,7 @@ class Agent(ABC):
 
     @staticmethod
     def held_by(frame: FrameType | None) -> str:
-        """Return a text naming the agent that has not returned, and its line, by a frame of its thread; "" if none."""
+        """Return a text naming the agent that has not returned, and its line, given a frame of its thread, or ""."""
         line = plugin.innermost_line(frame)
         while frame and frame.f_code is not Agent.answer.__code__:
             frame = frame.f_back
@@ -353,7 +353,7 @@ class AgentGroup(Agent):
     their stamp. The group takes the name of its last member, also the source of all messages but `AgentMessage`s.
 
     Args:
-        members: the agents, in any order but for the last; each steps at the gates of its own period.
+        members: the agents, in any order except the last, as above; each steps at the gates of its own period.
         hold_ns: `output_hold_ns` of the run.
 
     Raises:

@@ -18,7 +18,7 @@ from zsim.errors import DecodeError
 GAP_MAX = 10  # maximum number of consecutive lost gates to request again; the world is never farther ahead of an agent
 ALWAYS_NS = -1  # before every gate
 NEVER_NS = 2**63 - 1  # after every gate
-KEYS_MAX = 200_000  # maximum number of keys with cached readers; 1000 drones have about 15 000, and others may add more
+KEYS_MAX = 200_000  # limit on keys with cached readers; 1000 drones have about 15 000, and other programs may add more
 Input = tuple[str, Any]
 """A key and its message, or `keys.GATE` and a `GateMessages`."""
 
@@ -35,7 +35,7 @@ def output_hold_ns(info: Info) -> int:
 
 
 def is_held(key: str, gate_keys: Container[str], uncounted: Container[str]) -> bool:
-    """Whether a key's messages are outputs of other agents, to be delivered after the hold time."""
+    """Return whether a key's messages are outputs of other agents, to be delivered after the hold time."""
     return key not in gate_keys and key not in uncounted and messages.is_output(key)
 
 
@@ -59,8 +59,8 @@ class Inbox:
         uncounted: Sequence[str] = (),
         # closing keys whose publishers, such as drivers of external drones, may skip gates; awaited until they do
         sparse: Sequence[str] = (),
-        # delivery delay of agents' outputs on keys that close no gate, `output_hold_ns`: after it they have certainly
-        # arrived in lockstep, so that the order of arrival is irrelevant
+        # delivery delay of agents' outputs on keys that close no gate, `output_hold_ns`: in lockstep, all have arrived
+        # by then, so that the order of arrival is irrelevant
         hold_ns: int = 0,
     ) -> None:
         self._closing = dict.fromkeys(gate_keys)
@@ -196,7 +196,7 @@ class Inbox:
         return key if any(key not in self._lacking[gate] for gate in self._gates if gate > t_ns) else None
 
     def _waits_for(self, key: str, t_ns: int) -> bool:
-        """Whether a gate waits for a closing key.
+        """Return whether a gate waits for a closing key.
 
         A key whose publisher may skip gates is awaited if messages arrived for both of the last two gates taken.
         """
@@ -267,7 +267,7 @@ class _Meter:
             self.partial = False
 
     def is_short(self, t_ns: int) -> bool:
-        """Whether sensor messages of the gates up to t_ns are missing."""
+        """Return whether sensor messages of the gates up to t_ns are missing."""
         if self.partial:
             return False
         return bisect_right(self.arrivals, t_ns) < sum(count for gate_ns, count in self.counts if gate_ns <= t_ns)

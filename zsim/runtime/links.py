@@ -70,7 +70,7 @@ class Links:
         self._faults = [fault for fault in faults.faults if fault.kind in KINDS and concerned(fault)]
 
     def act_at(self, t_ns: int) -> bool:
-        """Whether links may change the inputs of a gate."""
+        """Return whether links may change the inputs of a gate."""
         return bool(self._radio or self._later) or any(fault_kinds.acts(fault, t_ns) for fault in self._faults)
 
     def delivered(self, t_ns: int, inputs: Sequence[Input]) -> list[Input]:
@@ -101,8 +101,8 @@ class Links:
     def _delay_ns(self, key: str, message: Any, acting: Sequence[Fault]) -> int | None:
         """Return the delay of a message [ns]; NEVER if it is lost.
 
-        If this process is the estimator of several drones, a sensor message is addressed to that of the drone in its
-        key. A radio fault affects messages of its drones to processes that are not on the same drone.
+        If this process is the estimator of several drones, a sensor message is addressed to the estimator of the drone
+        in its key. A radio fault affects messages of its drones to processes that are not on the same drone.
         """
         over_radio_ns = self._radio.delay_ns(key, message) if self._radio and isinstance(message, AgentMessage) else 0
         if over_radio_ns is None:
@@ -180,7 +180,7 @@ def total_delay_ns(
 
 
 def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
-    """Whether a fault affects the link from one of the senders `froms` to the receiver `to`."""
+    """Return whether a fault affects the link from one of the senders `froms` to the receiver `to`."""
     first, _, second = fault.target.partition("/")
     if second == to and first in froms:
         return True
@@ -210,7 +210,7 @@ def drone_of(process: str, drones: Container[str]) -> str | None:
 
 
 def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str, ...]:
-    """Return the names of the processes that count as the sender of a message.
+    """Return the names of the processes to treat as senders of a message.
 
     Agents that share a process, and thus its name, are named after the drone or cluster in the key.
 

@@ -94,7 +94,7 @@ class HealthMeter:
         self._steps_us.append(duration_ns / 1000)
 
     def due(self) -> bool:
-        """Return whether a health message is due, at most once per wall second."""
+        """Return whether a health message is due; if so, the next is due a period later."""
         return self._limit.spend()
 
     def message(self, t_ns: int, seq: int) -> Health:

@@ -33,7 +33,7 @@ ANOTHER_RUN = "the world has begun another run"
 REPLAY_S = 2.0  # wall-time limit of a replay; a hub answers within milliseconds, or never if the link is lost
 REJOINS_MAX = 6  # unanswered joins after which one is assumed to have arrived; a new router forwards nothing at first
 RETRY_S = 0.5  # wall time between attempts at an unanswered request to the world
-REQUESTS_MAX = 10  # maximum number of replays for a lost message; at the first it may still be on its way to the world
+REQUESTS_MAX = 10  # maximum number of replays for a lost message, which may reach the world only after the first
 RESUME_NS = 4_000_000_000  # maximum simulated age of a usable snapshot: the world keeps 5 s of history
 GATES_KEPT = 2  # gates whose outputs are kept for queries, as the contract demands; more if the world runs ahead
 
@@ -62,7 +62,7 @@ class Participant:
         next_seq: Callable[[str], int] | None = None,
     ) -> None:
         self.name = name
-        # whether it reports done although it is no agent; it must then subscribe to all its inputs before `announce`
+        # whether it reports done although not an agent; it must then subscribe to all its inputs before `announce`
         self.gates = slack_ns > 0
         self.now_ns = 0  # simulated time of the newest clock message received
         self.done_ns = -1  # newest gate done; -1 before the first
@@ -124,7 +124,7 @@ class Participant:
             self.publish("bye", self._membership.bye(self.now_ns, reason, failed))
 
     def tick(self) -> None:
-        """Rejoin if necessary, and publish health once per wall second; call this more often than that."""
+        """Rejoin if necessary, and publish health once per second of wall time; must be called more often."""
         if self.must_rejoin:
             self.must_rejoin = False
             self.join(is_rejoin=True)
@@ -133,7 +133,7 @@ class Participant:
         self.publish_health()
 
     def publish_health(self) -> None:
-        """Publish health if the last one is at least one wall second old."""
+        """Publish health if the last health message is at least a second of wall time old."""
         if self.health.due():
             self.publish("health", self.health.message(self.now_ns, self.next_seq("health")))
 
@@ -162,7 +162,7 @@ class Participant:
             self.take_entry(entry)
 
     def entry_in(self, payload: bytes) -> ProcessEntry | None:
-        """Return the admission of a process of this name from an event; None if the event is any other."""
+        """Return the admission of a process of this name from an event; None for any other event."""
         try:
             event = messages.read_event(payload)
         except DecodeError:
@@ -217,8 +217,8 @@ class AgentParticipant(Participant):
         self._recent_outputs: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
         self._unsent: Pairs = []
         self._resumed = False
-        self._unproved = 0  # joins left to repeat, unless the world proves that it goes on with this process …
-        self._proof_ns = 0  # … beyond this gate
+        self._unproved = 0  # joins left to repeat; none once a gate after `_proof_ns` is done
+        self._proof_ns = 0  # gates after this one prove that the world continues with this process
         self._missed_since_ns: int | None = None
         self._requested_ns, self._request_count = -1, 0
         self._retry_s = 0.0
@@ -230,7 +230,7 @@ class AgentParticipant(Participant):
     # Taking over from a predecessor
 
     def resume(self) -> int | None:
-        """Restore the agent from its predecessor's newest snapshot; return the snapshot's time, None if unusable.
+        """Restore the agent from its predecessor's newest snapshot; return its time, None if none is usable.
 
         The world's history must reach back to the snapshot: later messages are fetched and processed again.
         """
@@ -369,7 +369,7 @@ class AgentParticipant(Participant):
 
     @property
     def is_fetching(self) -> bool:
-        """Whether messages since a snapshot remain to be fetched."""
+        """Whether it awaits admission or has yet to fetch missed messages."""
         return self.awaited or self._missed_since_ns is not None
 
     def ask_again(self, t_ns: int, missing: str) -> None:

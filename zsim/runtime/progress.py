@@ -68,7 +68,7 @@ class SlowStart:
 
 
 class HoldReasons:
-    """Reasons for which clusters wait; a reason that persists is shown once."""
+    """The reasons why clusters wait; a reason that persists is shown once."""
 
     def __init__(self) -> None:
         self._since: dict[str, tuple[str, int]] = {}
@@ -191,7 +191,7 @@ class Screen:
         self.console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
 
     def hang_up(self) -> None:
-        """Stop live output, since the terminal has gone; draws nothing, so that a signal handler may call it."""
+        """Stop live output once the terminal has gone, without drawing, so that a signal handler may call this."""
         self._is_live = False
         self.console.quiet = True
 

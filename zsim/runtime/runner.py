@@ -79,7 +79,7 @@ class Runner:
             SupersededError: another process of the same name has taken over.
             RunError: the world has begun another run.
             BehindError: it needs messages that the world no longer keeps.
-            UserCodeError: a user's class raised, or returned an invalid value; the world has been informed.
+            UserCodeError: a user's class raised an exception or returned an invalid value; the world has been informed.
         """
         self._agent.rehearse()
         self._inputs.subscribe()
@@ -184,7 +184,7 @@ class Runner:
                 self._link.put(key, message)
         if self._lives_after_ns is None:
             self._lives_after_ns = t_ns - self._agent.period_ns
-        for fault in self._kills.values():  # only kills at this process's own gates count; their outputs are still sent
+        for fault in self._kills.values():  # only at gates that this process stepped; their outputs are still sent
             lives_after_ns = max(self._lives_after_ns, self._member.published_ns)
             if lives_after_ns < fault.from_ns + self._info.gate_ns <= t_ns:
                 self._leave, self.killed = f"killed by fault {fault.id}", True
@@ -256,7 +256,7 @@ class Runner:
 
 
 class RunnerInputs:
-    """Receives the messages of one agent into its inbox, and its rare inputs from Zenoh's threads."""
+    """Receives one agent's messages into its inbox, and queues its rare inputs from Zenoh's threads."""
 
     def __init__(
         self, link: Session, info: messages.Info, agent: Agent, health: HealthMeter, say: Callable[[str], None]
@@ -307,7 +307,7 @@ class RunnerInputs:
         self._link.declare_process(self._agent.name)
 
     def wait(self) -> None:
-        """Wait for a message that may complete the next gate, or until woken; SessionError if the session is closed."""
+        """Wait for a message that may complete the gate, or for `wake`; raise SessionError if the session is closed."""
         awaited_key = self.inbox.last_missing() or self._agent.gate_keys[-1]
         expression = self._agent.reads[self._expressions.readers(awaited_key)[0]]
         self._blocking = self._subscriptions[expression if expression in self._subscriptions else self._gate_key]
@@ -372,7 +372,7 @@ class RunnerInputs:
         return sorted((faults for faults in lists if faults.t_ns < t_ns), key=lambda faults: faults.seq)
 
     def repeated(self, t_ns: int) -> Iterator[tuple[str, Any]]:
-        """Remove and yield the requests that the predecessor accepted before a gate."""
+        """Remove and yield the requests accepted by the predecessor that are to be repeated before a gate."""
         if self._repeated:
             for (key, _), request in sorted(self._repeated.pop(t_ns, {}).items(), key=itemgetter(0)):
                 yield key, request

@@ -292,7 +292,7 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
 
 
 def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
-    """Yield drag coefficients so large that slow air would push as hard as the weight: their unit is wrong.
+    """Yield faults of drag coefficients with which slow air would push as hard as the weight: a wrong unit is likely.
 
     A coefficient that is too small cannot be distinguished from an omitted one.
     """
@@ -320,7 +320,7 @@ def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
 
 
 def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fault]:
-    """Yield values of mass, rotors and battery that make a hover implausible, which indicates a wrong unit."""
+    """Yield faults of mass, rotors and battery that make a hover implausible, which indicates a wrong unit."""
     count, shares = len(vehicle.rotors), lift_shares(vehicle)
     thrust, torque = drone.thrust_n_s2, drone.torque_nm_s2
     low, high = drone.rotor_min_rad_s, drone.rotor_max_rad_s
@@ -460,7 +460,7 @@ def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Faul
 
 
 def _in_line(points: list[Any]) -> bool:
-    """Whether points (n, 3) are collinear: within TEMPLATE_WIDTH_MIN_M of a line, root mean square."""
+    """Return whether points (n, 3) are collinear: within TEMPLATE_WIDTH_MIN_M of a line, root mean square."""
     p = np.array(points, dtype=float)
     widths = singular_values(p - p.mean(axis=0)) / np.sqrt(len(p))
     return el.length(widths[1:].tolist()) < TEMPLATE_WIDTH_MIN_M

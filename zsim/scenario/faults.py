@@ -240,7 +240,7 @@ def _plain(value: Any, p: FaultParameter) -> Any:
 
 
 def acts(fault: Fault, gate_ns: int) -> bool:
-    """Whether a fault acts in the gate that ends at `gate_ns`."""
+    """Return whether a fault acts in the gate that ends at `gate_ns`."""
     return fault.from_ns < gate_ns and (fault.until_ns is None or gate_ns <= fault.until_ns)
 
 
@@ -346,7 +346,7 @@ def _link_flaws(actual: str, target: Any, one_way: bool, known: Known) -> Iterat
 
 
 def _allowed_instead(name: str, known: Known) -> str | None:
-    """Return what a process must be named instead; None if `name` is acceptable, as most are for users' processes."""
+    """Return what a process must be named instead; None if `name` is allowed, as most are, for users' processes."""
     if not keys.PROCESS_NAME.fullmatch(name):
         return "1 to 48 of a-z 0-9 _ . -"
     if name in known.processes:
@@ -404,7 +404,7 @@ def _is_vector(value: Any, low: float, high: float) -> bool:
 
 
 def _within(value: Any, low: float, high: float, is_open: bool = False) -> bool:
-    """Whether a value is a number within limits; integers may be arbitrarily large, NaN is never within."""
+    """Return whether a value is a number within limits; integers may be arbitrarily large, NaN is never within."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return number and low <= value <= high and not (is_open and value == low)
 

@@ -27,7 +27,7 @@ from zsim.scenario.surroundings import TRIANGLE, TRIANGLES_MAX, packed, unpacked
 from zsim.schema import plugin
 from zsim.schema.checker import Fault, faults, faults_in, show, sound
 
-TRIES_MAX = 500  # attempts to place a trunk before the forest counts as full; design choice: bounds the time it takes
+TRIES_MAX = 500  # attempts to place a trunk before the forest is deemed full; design choice: bounds the time it takes
 BYTES_MAX = 100_000_000  # maximum size of a file
 Entry = dict[str, Any]
 Array = NDArray[np.float64]
@@ -214,7 +214,7 @@ def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
     each cell gives two triangles.
 
     Raises:
-        DocumentError: the file cannot be read, or is not a mesh or height map; its line begins with `where`.
+        DocumentError: the file cannot be read, or is not a mesh or height map; the line begins with `where`.
     """
     kind = path.suffix.lower()
     if kind in (".csv", ".npy"):
@@ -243,7 +243,7 @@ def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
 
 
 def points_of(path: Path, where: str) -> Array:
-    """Return the finite points of a cloud, (P, 3) [m]; raises the errors of `triangles_of`."""
+    """Return the finite points of a cloud, (P, 3) [m]; errors as for `triangles_of`."""
     kind = path.suffix.lower()
     if kind == ".pcd":
         read = lambda p: importlib.import_module("pypcd4").PointCloud.from_path(p).numpy(("x", "y", "z"))  # noqa: E731

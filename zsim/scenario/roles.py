@@ -1,6 +1,6 @@
 """Roles of a federation: the names, agent classes, requirements and key rights of their processes.
 
-Launchers, the world and access control use the table. Rights are the minimum that a role needs. They follow from the
+Launchers, the world and access control use `ROLES`. Rights are the minimum that a role needs. They follow from the
 writers and readers declared by the messages of the contract (`zsim.contract.messages.TOPICS`); Zenoh's access control
 and the world's replays enforce them.
 """
@@ -109,12 +109,12 @@ def on_overdue(
 
 
 def lets_drop(actions: Mapping[str, str], name: str) -> bool:
-    """Whether a scenario explicitly lets a run continue without a process, which then does not count as a failure."""
+    """Return whether a scenario explicitly lets a run continue without a process, whose loss is then no failure."""
     return (actions.get(name) or actions.get(name.partition(".")[0])) == "drop"
 
 
 def is_needed(name: str) -> bool:
-    """Whether by default a run cannot continue without a process."""
+    """Return whether by default a run cannot continue without a process."""
     role = ROLES.get(name.partition(".")[0])
     return role is not None and role.on_overdue == "end"
 
@@ -150,7 +150,7 @@ def drivers_of(scenario: Scenario) -> list[str]:
 
 
 def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
-    """Return a line about the drivers to start with a run; empty without external drones."""
+    """Return a line about the drivers to start with a run, in a list that is empty without external drones."""
     drivers, awaited_names = drivers_of(scenario), expected_processes(scenario)
     awaited, others = (listed([d for d in drivers if (d in awaited_names) is expected]) for expected in (True, False))
     waits = [f"the run waits for {awaited}"] if awaited else []

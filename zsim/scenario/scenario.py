@@ -66,7 +66,7 @@ class Piloted(Spec, frozen=True, kw_only=True):
     fit: bool = False
     """Whether a path that is too fast for the drone is slowed down; otherwise it is refused."""
     gain_1_s: Annotated[float, Meta(gt=0, le=2)] = 0.6  # position gain; design choice: as for formations
-    lead_s: Annotated[float, Meta(ge=0, le=2)] = 0.4  # lag of the AR.Drone: 0.33 s of velocity loop, 0.11 s of tilt
+    lead_s: Annotated[float, Meta(ge=0, le=2)] = 0.4  # lag of the AR.Drone: 0.33 s in the velocity loop, 0.11 s in tilt
 
 
 class PathPoint(Spec, frozen=True, kw_only=True):
@@ -320,7 +320,7 @@ class Waypoint(Spec, frozen=True, kw_only=True):
 
 
 class Trajectory(Spec, frozen=True, kw_only=True):
-    """A reference as expressions of t (seconds since `start_s`) or as waypoints."""
+    """A reference as expressions in t (seconds since `start_s`) or as waypoints."""
 
     start_s: NonNegative = 0.0
     constants: Annotated[dict[str, Real], Meta(max_length=CONSTANTS_MAX)] = {}
@@ -433,21 +433,21 @@ class Processes(Spec, frozen=True, kw_only=True):
     """Roles, other than those of agents, that the run waits for; unset: none."""
 
     def gates(self, role: str) -> bool:
-        """Whether the run waits for the processes of a role that is not an agent's."""
+        """Return whether the run waits for the processes of a role that is not an agent's."""
         return self.gating is not UNSET and role in self.gating
 
 
 class TimeSteps(Spec, frozen=True, kw_only=True):
     """Steps of simulated time; all are design choices."""
 
-    gate_ms: Annotated[float, Meta(gt=0, le=1000)] = 20.0  # 50 Hz, fast against the formation loop's 1.7 s
+    gate_ms: Annotated[float, Meta(gt=0, le=1000)] = 20.0  # 50 Hz, fast compared with the formation loop's 1.7 s
     physics_dt_ms: Annotated[float, Meta(gt=0, le=20)] = 2.5  # a twelfth of the rotors' lag, the fastest dynamics
     command_delay_gates: Annotated[int, Meta(ge=1, le=50)] = 1  # the minimum that lets world and agents run in parallel
     max_command_age_ms: Positive = 500.0  # equals silence.hover_s: an older command counts as silence
 
 
 class OwnProgram(Spec, frozen=True, kw_only=True):
-    """A program in any language that is started with the run; it joins as a process under its own name."""
+    """A program in any language that is started with the run; it may join as a process under its own name."""
 
     command: Annotated[list[str], Meta(min_length=1, max_length=WORDS_MAX)]
     """`{endpoint}`, `{federation}`, `{folder}` (of the run) and `{name}` are replaced by their values."""
@@ -619,7 +619,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
         return sorted(declared, key=lambda each: each.key)
 
     def own_code(self) -> list[str]:
-        """Return the users' classes, functions, sensors and vehicles that are named; a rerun needs their modules."""
+        """Return the users' classes, functions, sensors and vehicles named here; a rerun needs their modules."""
         spaces = [part.space for cluster in self.clusters for part in (cluster, *cluster.groups)]
         names = [*spaces, *(cluster.law for cluster in self.clusters), self.estimation.chosen()]
         names += self.report.metric_names

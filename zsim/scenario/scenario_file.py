@@ -35,7 +35,7 @@ _PATH = re.compile(r"([^.\[\]]+|\[[^\[\]]+\])(\.[^.\[\]]+|\[[^\[\]]+\])*")
 AXES = ("x", "y", "z", "yaw")
 TERMS = 8
 HEADER = ("duration", *(f"{axis}^{power}" for axis in AXES for power in range(TERMS)))
-BYTES_MAX = 2_000_000  # bytes; a file with five thousand pieces has about that
+BYTES_MAX = 2_000_000  # bytes; about the size of a file with five thousand pieces
 
 
 def load(
@@ -217,7 +217,7 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
 
 
 def _is_graph(topology: Any) -> bool:
-    """Whether a `topology:` section is only a graph, given by name or as lists of the drones that each drone hears."""
+    """Return whether a `topology:` section is only a graph: a name, or lists of the drones that each drone hears."""
     if isinstance(topology, dict):
         has_lists = any(isinstance(senders, list) for senders in topology.values())
         return has_lists and not topology.keys() & set(Topology.__struct_fields__)

@@ -70,7 +70,7 @@ class Surroundings:
     """The obstacles and surfaces of a scenario's environment.
 
     Attributes:
-        is_empty: whether there is no obstacle and no surface.
+        is_empty: whether there are neither obstacles nor surfaces.
     """
 
     def __init__(self, environment: Any) -> None:
@@ -127,7 +127,7 @@ def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, 
 
 
 def min_distances(obstacles: Iterable[Any], p_W: ArrayLike) -> NDArray[np.float64]:
-    """Return the distance [m] of each point (T, 3) from the nearest obstacle, as `nearest` does; inf without any."""
+    """Return the distance [m] of each point (P, 3) from the nearest obstacle, as `nearest` does; inf without any."""
     points, rows = np.asarray(p_W, dtype=float).reshape(-1, 3), np.array([*map(row_of, obstacles)]).reshape(-1, COLUMNS)
     minima, step = np.full(len(points), np.inf), max(1, PAIRS_MAX // max(len(rows), 1))
     for first in range(0, len(points) if len(rows) else 0, step):
@@ -286,7 +286,7 @@ def nearest_points(sheet: Held, p_W: ArrayLike, far_m: ArrayLike) -> tuple[Array
 
 @kernel()
 def _find_nearest(held: Held, points: NDArray, distances: NDArray, positions: NDArray) -> None:
-    """Fill `positions` (P, 3) with the points nearest to `points`, and reduce the limits `distances` (P,) to theirs."""
+    """Fill `positions` (P, 3) with the points nearest to `points`; replace the limits in `distances` (P,)."""
     for k in range(points.shape[0]):
         nearest = nearest_point(held.content, (points[k, 0], points[k, 1], points[k, 2]), distances[k])
         distances[k] = nearest.distance
@@ -374,7 +374,7 @@ def _square(bounds: NDArray, x: Vector) -> float:
 
 @noinline
 def crosses(sheet: Sheet, start: Vector, end: Vector) -> bool:
-    """Whether the segment between two points crosses a triangle; an end in its plane counts as in front of it."""
+    """Return whether the segment between two points crosses a triangle; an end in its plane is taken to be in front."""
     tree = sheet.tree
     if tree.bounds.shape[0] == 0:
         return False

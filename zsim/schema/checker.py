@@ -24,7 +24,7 @@ Fault = tuple[str, str]  # (path, "is …; must be …"); the path of the docume
 
 
 def faults(value: Any, description: Any, path: str = "") -> Iterator[Fault]:
-    """Yield the path and text of every fault of `value` against the type `description`."""
+    """Yield the path and text of every fault in `value`, checked against the type `description`."""
     yield from _check(value, _type_info(description), path)
 
 
@@ -230,7 +230,7 @@ def show(value: Any) -> str:
 
 
 def _as_json(value: Any) -> str:
-    """Return maps and lists as JSON, with NaN and infinities by name."""
+    """Return a value as text in the style of JSON, with NaN and infinities by name."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{_as_json(key)}: {_as_json(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):

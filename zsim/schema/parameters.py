@@ -89,5 +89,5 @@ def bound(kind: Any, given: Any, where: str) -> Any:
 
 
 def has_parameters(kind: Callable[..., Any]) -> bool:
-    """Whether a class declares `Parameters`."""
+    """Return whether a class declares `Parameters`."""
     return getattr(kind, "Parameters", None) is not None

@@ -46,7 +46,7 @@ CLASS_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z"
 
 
 def search(*paths: Path) -> None:
-    """Search for modules in the folders of the current document, in this process and its child processes.
+    """Set the folders of the current document, in which this process and its children search for modules.
 
     Former folders are replaced, so that the environment of a program that reads many documents does not grow.
 
@@ -145,12 +145,12 @@ def load_object(name: str, where: str, attribute: str, kind: type[Object]) -> Ob
 
 
 def is_own(kind: type) -> bool:
-    """Whether a class belongs to a user, not to zsim."""
+    """Return whether a class belongs to a user, not to zsim."""
     return kind.__module__.partition(".")[0] not in PACKAGES
 
 
 def is_library(path: str) -> bool:
-    """Whether a file belongs to Python or an installed package."""
+    """Return whether a file belongs to Python or an installed package."""
     return path.startswith(LIBRARIES) or "site-packages" in path or "dist-packages" in path
 
 
@@ -191,7 +191,7 @@ def innermost_line(frame: FrameType | None) -> str:
 
 
 def is_user_frame(frame: FrameType) -> bool:
-    """Whether a frame is in a user's file or notebook, or in an installed package named in a document."""
+    """Return whether a frame is in a user's file or notebook, or in an installed package named in a document."""
     package, path = frame.f_globals.get("__name__", "").partition(".")[0], frame.f_code.co_filename
     if package in PACKAGES or (path.startswith("<") and package != "__main__"):
         return False

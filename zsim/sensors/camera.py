@@ -68,7 +68,7 @@ class SightingModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """Error of a large hat's centre, standard deviation per axis."""
     diameter_px: ErrorPx = 0.11  # error of a large hat's apparent diameter, standard deviation
     noise_px2: NonNegative = 0.65
-    """Error times apparent diameter, added in quadrature to both above; on a clear day, and larger in low light."""
+    """Error times apparent diameter, added in quadrature to both above; for a clear day, larger in low light."""
     blur_share: NonNegative = 0.018
     """Error as a share of the hat's motion in the picture during the exposure, likewise added in quadrature."""
     diameter_min_px: Positive = 4.0  # hats with a smaller measured diameter are not reported

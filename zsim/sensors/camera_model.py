@@ -107,7 +107,7 @@ def distortion_slopes(lens: Lens, x: Number, y: Number) -> tuple[Number, Number,
 
 
 def folds(lens: Lens) -> bool:
-    """Whether the distortion folds the picture, so that some pixel corresponds to no unique ray."""
+    """Return whether the distortion folds the picture, so that some pixel corresponds to no unique ray."""
     u, v = np.meshgrid(*(np.linspace(0.0, side - 1.0, FOLD_GRID) for side in (lens.width, lens.height)))
     with np.errstate(all="ignore"):
         x, y = undistorted(lens, u.ravel(), v.ravel())

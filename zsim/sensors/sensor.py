@@ -81,7 +81,7 @@ class Channel(Struct, frozen=True, omit_defaults=True):
     """Consecutive numbers of a reading that share an ErrorModel.
 
     Attributes:
-        settings: field of the sensor's settings that holds the ErrorModel.
+        settings: name of the field of the sensor's settings that contains the ErrorModel.
         unit: unit of the ErrorModel and of the bias added by a fault.
         width: count of the numbers.
         to_si: factor from `unit` to the unit of the equation's values, e.g. pi / 180 where settings are in deg/s and
@@ -221,7 +221,7 @@ def noise_sigma(model: ErrorModel, rate_hz: float) -> float:
 
 
 def message_type(name: str, fields: Mapping[str, str], sensor: str = "") -> type[Sample]:
-    """Return a message class of a user's sensor; equal arguments give the same class."""
+    """Return the message class of a user's sensor; equal arguments give the same class."""
     return declared_type(name, fields, Sample, (("__sensor__", sensor),))
 
 

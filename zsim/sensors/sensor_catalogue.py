@@ -63,7 +63,7 @@ class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     lidar: LidarConfig | UnsetType = UNSET
     depth: DepthConfig | UnsetType = UNSET
     own: dict[str, dict[str, Any]] | UnsetType = UNSET
-    """Users' sensors by name: all their settings, `module` and `declared`. A file lists them among the other sensors,
+    """Users' sensors by name: all their settings, `module` and `declared`. A file lists them among the other sensors;
     see `flattened`."""
 
     def cameras(self) -> dict[str, Camera]:
@@ -197,7 +197,7 @@ def declarations(drones: Any) -> dict[str, Declaration]:
 
 
 def own_sections(drone: Any) -> dict[str, dict[str, Any]]:
-    """Return the sections of the users' sensors on a drone; empty if they are faulty."""
+    """Return the sections of the users' sensors on a drone; empty if there are none or they are faulty."""
     own = drone.sensors.own if drone.sensors is not None else None
     return own if isinstance(own, dict) else {}
 

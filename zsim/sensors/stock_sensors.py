@@ -14,7 +14,7 @@ BOARD_RATE_HZ = 200.0  # Hz, rate of IMU samples and firmware steps on the AR.Dr
 
 
 class Imu(Sample, frozen=True):
-    """Specific force [m/s^2] and body rate [rad/s] in the sensor's axes; level at rest, the force is (0, 0, +9.81)."""
+    """Specific force [m/s^2] and body rate [rad/s] in sensor axes; at rest and level, the force is (0, 0, +9.81)."""
 
     accel_m_s2: Vector3
     gyro_rad_s: Vector3

@@ -19,7 +19,7 @@ from zsim.transport.tls import Identity, Permissions, permissions_of
 from zsim.transport.zenoh_settings import Mode, Settings
 
 ATTEMPT_S = 1.0  # limit of one attempt to connect, so that waiting can be reported and interrupted
-PAUSE_S = 0.1  # between queries to a hub without an answer from a world, which may be starting or in another federation
+PAUSE_S = 0.1  # between queries to a hub while no world answers; it may be starting, or be in another federation
 ANSWER_S = 1.0  # time limit of an answer; a hub answers within milliseconds, unless it is still compiling
 _OS_ERROR = re.compile(r"(?:os error |code: )(\d+)")
 _OTHER = "give another with --listen, and with --connect to the other commands"
@@ -74,7 +74,7 @@ def connect(
     federation: str,
     mode: Mode = "lockstep",  # mode of the run, if known
     wait_s: float | None = None,  # how long to keep trying; None: 0.5 s
-    # whether the run never waits for it: even in lockstep, a silence of LEASE_READER_MS then counts as its death
+    # whether the run never waits for it: even in lockstep, a silence of LEASE_READER_MS is then taken as its death
     reader: bool = False,
     identity: Identity | None = None,  # host and certificate; by default this host's name and no TLS
 ) -> Iterator[Session]:
@@ -144,8 +144,8 @@ def find_world(
 
     Raises:
         NoWorldError: no world answered within `wait_s`, its answer is unusable, or `stopped` returned true.
-        SessionError: waiting would not help: the endpoint is malformed, or the certificate refused or not admitted.
-        BadNameError: the federation's name is outside the contract.
+        SessionError: waiting would not help: the endpoint is malformed, or a certificate is refused or not admitted.
+        BadNameError: the contract does not allow the federation's name.
     """
     keys.name(federation, "federation")
     dial = partial(connect, endpoint, federation, reader=reader, identity=identity)

@@ -135,7 +135,7 @@ class LinkWatch:
         return lines
 
     def _holds_up(self, address: str, held_bytes: int, now_s: float) -> bool:
-        """Whether the far end of a link acknowledges nothing, or never catches up."""
+        """Return whether the far end of a link acknowledges nothing, or never catches up."""
         if held_bytes < STALL_BYTES:
             self._backlogs.pop(address, None)
             return False
@@ -216,7 +216,7 @@ class SessionTokens:
         return list(self._sessions)
 
     def is_alive(self, process: str) -> bool:
-        """Whether any session holds a token of a process."""
+        """Return whether any session has declared a token of a process."""
         return process in self._alive or process in self._sessions
 
     def processes(self, session: str) -> tuple[str, ...]:

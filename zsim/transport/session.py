@@ -280,7 +280,7 @@ class Session:
         return publisher
 
     def has_subscribers(self, key: str) -> bool:
-        """Whether one of our keys has subscribers; cached, since querying Zenoh at each gate is too slow."""
+        """Return whether one of our keys has subscribers; cached, since querying Zenoh at each gate is too slow."""
         if key in self._matching:
             return self._matching[key]
         publisher = self._publishers.get(key) or self._declare(key)
@@ -518,7 +518,7 @@ def open_session(
         yield session
     finally:
         session.undeclare_all()
-        with suppress(zenoh.ZError):  # a stopped process at the far end does not take its remaining messages
+        with suppress(zenoh.ZError):  # a stopped process at the far end does not read its remaining messages
             raw.close()
 
 

@@ -25,7 +25,7 @@ from zsim.errors import NoListenerError, SessionError
 CERTIFICATES = AUTHORITY, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"  # files made by `zsim certs init`
 DAYS = 30.0  # validity of a certificate
 PROBE_S = 2.0  # timeout of each step of the handshake; a running listener answers within milliseconds
-LATE_S = 1.0  # in TLS 1.3 a server checks the client's certificate after the client has finished
+LATE_S = 1.0  # wait for a refusal: in TLS 1.3 a server checks the client's certificate after the client has finished
 NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME, openssl/x509_vfy.h
 ENCRYPTED = ("tls", "quic")  # protocols in Zenoh's wheel with certificates
 NETWORKED = ("tcp", "udp", "ws")  # unencrypted protocols in Zenoh's wheel that leave the machine
@@ -63,7 +63,7 @@ def is_tls(endpoint: str) -> bool:
 
 
 def leaves_machine(endpoint: str) -> bool:
-    """Whether an endpoint's links may leave this machine unencrypted, as to any host name other than localhost."""
+    """Return whether an endpoint's links may leave this machine unencrypted, as to any host name but localhost."""
     protocol, _, address = endpoint.partition("/")
     host = (address.rpartition(":")[0] or address).strip("[]")
     if protocol not in NETWORKED or host == "localhost":
@@ -89,14 +89,15 @@ def own_fault(identity: Identity) -> str | None:
         return f"{identity.tls}: certificate.pem, key.pem and ca.pem do not match ({_reason(error)}); {REMEDY}"
     if fault := _date_fault(certificate):
         return fault
+    # under another name, access control would drop everything that this process sends
     actual, expected = _name(certificate), identity.process
     if expected in ("", actual):
-        return None  # otherwise access control would drop everything that this process sends
+        return None
     return f"{identity.tls}: the certificate is for {actual}; must be for {expected}; give the right --tls folder"
 
 
 def own_name(identity: Identity) -> str:
-    """Return the name in a process's own certificate, which must be valid by `own_fault`."""
+    """Return the name in a process's own certificate, which must be valid according to `own_fault`."""
     return _name(_read_own(identity))
 
 

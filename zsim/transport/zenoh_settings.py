@@ -26,13 +26,13 @@ CONNECT_RETRY_MS = 100
 # Silent connections block new ones once this many are open, until they time out: with Zenoh's defaults, 100 and 10 s, a
 # hundred of them blocked joins for 10 s. A handshake takes a few round trips: 2 s with TLS over a satellite link.
 ACCEPT_PENDING, ACCEPT_MS = 1000, 3_000
-SESSIONS_MAX = 4_000  # at a hub; Zenoh's default of 1000 is two short of a run with 1000 drones
-QUEUE_LOCKSTEP = 16  # batches of 48 kB; Zenoh's maximum, its default is 2
+SESSIONS_MAX = 4_000  # at a hub; Zenoh's default of 1000 is two too few for a run with 1000 drones
+QUEUE_LOCKSTEP = 16  # batches of 48 kB; Zenoh's maximum (its default is 2)
 
 _CLOSE_AFTER = "transport/link/tx/queue/congestion_control/block/wait_before_close"
 _TLS = "transport/link/tls"
 ACCESS = "access_control"
-# In Zenoh's wheel; a client that connects with another one would wait for ever, since Zenoh reports only a timeout.
+# Protocols in Zenoh's wheel; a client with any other would wait forever, since Zenoh reports only a timeout.
 PROTOCOLS = (*tls.NETWORKED, *tls.ENCRYPTED, "unixsock-stream")
 
 SESSION_FILES = 32  # open files of a process with a session; 22 measured, the rest for files read while it loads

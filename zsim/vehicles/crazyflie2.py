@@ -61,7 +61,7 @@ VEHICLE = Vehicle(
         hold_1_s=0.5,  # 1/s, in the same ratio to the velocity loop as for the AR.Drone
         height_1_s=0.9,  # 1/s, in the same ratio to the climb loop as for the AR.Drone
         brake_s=0.8,  # s, longer since the velocity loop is slower
-        takeoff_m_s=0.3,  # m/s, design choice: about half of the take-off height per second
+        takeoff_m_s=0.3,  # m/s, design choice: 0.6 take-off heights per second, as for the AR.Drone
         descent_m_s=0.3,  # m/s, design choice: gentler, since its feet are hard
         flare_m=1.0,  # m, design choice: half of the AR.Drone's, since it flies lower
     ),

@@ -108,8 +108,8 @@ class Battery(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class Firmware(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Design parameters of the firmware's loops, sequences and observer.
 
-    The loop gains follow from the rotors' lag: the rate gain is `rate_per_lag` over the lag that remains after
-    overdriving, and those of tilt and velocity are each smaller than that of their inner loop by `loop_ratio`.
+    The loop gains follow from the rotors' lag: the rate gain is `rate_per_lag` divided by the lag that remains after
+    overdriving; the gains of tilt and velocity are those of their inner loops divided by `loop_ratio`.
     """
 
     lag_lead: Annotated[float, Meta(gt=0, le=1)]  # share of the rotors' lag that remains after overdriving
@@ -133,8 +133,8 @@ class Firmware(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     descent_far_1_s: NonNegative  # increase of that speed per metre above flare_m
     flare_m: NonNegative
     touch_share: Fraction  # ratio of thrust to weight below which a drone that does not descend is on the ground
-    touch_m_s: Positive  # descent speed below which a drone counts as not descending
-    touch_s: NonNegative  # time for which both must hold before the rotors stop
+    touch_m_s: Positive  # descent speed below which a drone is taken not to descend
+    touch_s: NonNegative  # time for which both conditions must be met before the rotors stop
     low_battery_percent: Annotated[float, Meta(ge=0, le=50)]  # below this it lands; twice this is needed to take off
     disturbance_walk: Positive  # random walk of the horizontal disturbance, m/s^2/sqrt(s)
     lift_walk: Positive  # random walk of the vertical disturbance, m/s^2/sqrt(s)
@@ -247,7 +247,7 @@ def allocation(vehicle: Vehicle) -> np.ndarray:
 
 
 def is_balanced(vehicle: Vehicle) -> bool:
-    """Whether the rotors give no moment at equal speeds."""
+    """Return whether the rotors give no moment at equal speeds."""
     return bool(np.abs(allocation(vehicle).sum(axis=1)).max() <= BALANCE_MAX * len(vehicle.rotors))
 
 

@@ -282,7 +282,7 @@ class FileServer:
         content_queue: asyncio.Queue[bytes | None] = asyncio.Queue(1)
         _reply(writer, "220 AR.Drone")
         try:
-            while line := await asyncio.wait_for(reader.readline(), IDLE_TIMEOUT_S):
+            while line := await _read_line(reader):
                 verb, _, argument = line.decode("ascii", "replace").strip().partition(" ")
                 verb = verb.upper()
                 if verb == "QUIT":
@@ -310,7 +310,8 @@ class FileServer:
         content_queue: asyncio.Queue[bytes | None] = asyncio.Queue(1)
 
         async def send(_: asyncio.StreamReader, data_writer: asyncio.StreamWriter) -> None:
-            content = await asyncio.wait_for(content_queue.get(), DATA_TIMEOUT_S)
+            async with asyncio.timeout(DATA_TIMEOUT_S):
+                content = await content_queue.get()
             data_writer.write(content or b"")
             await data_writer.drain()
             content_queue.task_done()
@@ -338,10 +339,16 @@ class FileServer:
             listing = "".join(f"{each}\r\n" for each in self._files).encode("ascii")
             _reply(writer, "150 sending data")
             content_queue.put_nowait(self._files[name] if verb == "RETR" else listing)
-            await asyncio.wait_for(content_queue.join(), DATA_TIMEOUT_S)
+            async with asyncio.timeout(DATA_TIMEOUT_S):
+                await content_queue.join()
             _reply(writer, "226 done")
         if data_port is not None:
             await data_port.close()
+
+
+async def _read_line(reader: asyncio.StreamReader) -> bytes:
+    async with asyncio.timeout(IDLE_TIMEOUT_S):
+        return await reader.readline()
 
 
 def _reply(writer: asyncio.StreamWriter, text: str) -> None:

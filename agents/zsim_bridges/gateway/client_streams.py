@@ -243,7 +243,8 @@ async def stream_events(
         await response.prepare(request)
         while True:
             try:
-                chunk = b"".join(await asyncio.wait_for(outbox.take(), KEEPALIVE_S))
+                async with asyncio.timeout(KEEPALIVE_S):
+                    chunk = b"".join(await outbox.take())
             except TimeoutError:
                 chunk = b": still here\n\n"
             await response.write(chunk)
@@ -294,7 +295,8 @@ class PictureFeed:
         """Return the newest picture if it comes after `number`, otherwise the next; None if none arrives in time."""
         if self.newest is None or self.newest.number <= number:
             try:
-                await asyncio.wait_for(self._arrived.wait(), timeout_s)
+                async with asyncio.timeout(timeout_s):
+                    await self._arrived.wait()
             except TimeoutError:
                 return None
         return self.newest

@@ -374,7 +374,8 @@ class SubscribedTopic:
         protocol, host, port = await asyncio.to_thread(master_api.call_api, uri, "requestTopic", *arguments)
         if protocol != "TCPROS":
             raise RefusedError(f"protocol is {str(protocol)[:20]!r}; must be TCPROS")
-        reader, writer = await asyncio.wait_for(asyncio.open_connection(host, port), HANDSHAKE_TIMEOUT_S)
+        async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
+            reader, writer = await asyncio.open_connection(host, port)
         try:
             configure(writer, True)
             writer.write(encode_header(subscriber_header(self.topic_type, self._caller)))
@@ -486,7 +487,8 @@ async def read_header(reader: StreamReader) -> dict[str, str]:
         ValueError: the header is malformed.
         TimeoutError: it does not arrive within HANDSHAKE_TIMEOUT_S.
     """
-    return decode_header(await asyncio.wait_for(read_frame(reader, HEADER_MAX), HANDSHAKE_TIMEOUT_S))
+    async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
+        return decode_header(await read_frame(reader, HEADER_MAX))
 
 
 def configure(writer: StreamWriter, nodelay: bool) -> None:

@@ -146,7 +146,8 @@ class VehicleServer(ABC):
             stack.callback(intake.close)
             while not (stopped() or self.observer.end_reason):
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(intake.arrival_event.wait(), POLL_S)
+                    async with asyncio.timeout(POLL_S):
+                        await intake.arrival_event.wait()
                 await self.on_arrivals(intake)
                 self.observer.tick()
 

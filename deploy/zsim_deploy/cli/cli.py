@@ -96,7 +96,7 @@ def main() -> None:
         sys.stdout.flush()
     except BrokenPipeError:
         code = code or UNREAD
-        null = os.open(os.devnull, os.O_WRONLY)  # takes the output that is no longer read, as behind `| head`
+        null = os.open(os.devnull, os.O_WRONLY)  # takes the output that is no longer read, as with `| head`
         for stream in filter(is_unread, STREAMS):
             os.dup2(null, stream)
     sys.exit(code)

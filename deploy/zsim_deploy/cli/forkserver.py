@@ -1,10 +1,10 @@
 """The fork server: imports the modules of roles, loads the compiled kernels, and forks a role for each request.
 
 Standard input is a sequenced-packet socket to the launcher. When everything is loaded, the fork server sends READY.
-From then on each packet from the launcher holds the arguments of a `zsim` command as a JSON list, with four open files:
-the role's standard input, output and error, and one from which it reads a byte before it begins. The reply is the
-role's process id. The role is a child of the launcher, not of this process, which ends as soon as the launcher closes
-the socket or dies. A role whose process id has not reached the launcher never gets that byte, and ends too.
+From then on, each packet from the launcher contains the arguments of a `zsim` command as a JSON list, with four open
+files: the role's standard input, output and error, and one from which it reads a byte before it begins. The reply is
+the role's process id. The role is a child of the launcher, not of this process, which ends as soon as the launcher
+closes the socket or dies. A role whose process id has not reached the launcher never gets that byte, and ends too.
 """
 
 import atexit

@@ -123,7 +123,7 @@ def older_processor() -> dict[str, str]:
     settings = {"NPY_DISABLE_CPU_FEATURES": " ".join(getattr(numpy_core, "__cpu_dispatch__", ()))}
     if platform.machine() in ("x86_64", "AMD64"):
         settings["OPENBLAS_CORETYPE"] = "Nehalem"  # SSE4.2 at most
-        settings["GLIBC_TUNABLES"] = "glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F,-AVX2_Usable,-FMA_Usable"  # for any glibc
+        settings["GLIBC_TUNABLES"] = "glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F,-AVX2_Usable,-FMA_Usable"  # old names too
     else:
         settings["OPENBLAS_CORETYPE"] = "ARMV8"
     return {name: value for name, value in settings.items() if value}
@@ -133,7 +133,7 @@ def _check_processor(scenario: Path, duration_s: float) -> str:
     """Fly the start of a scenario as on two processors; return where the flights first differ, empty if nowhere.
 
     The scenario is flown normally; its record is then rerun with the code of the C library, BLAS and numpy for an older
-    processor: on x86, one of 2008 without fused operations. zsim's own code gives the same results with both. A
+    processor: on x86, one of 2008 without fused multiply-add. zsim's own code gives the same results with both. A
     difference comes from a user's class that calls functions whose results depend on the processor: np.linalg or `@`,
     np.exp on arrays, math.sin. Raise RunError if the scenario cannot be flown in one process.
     """

@@ -79,7 +79,7 @@ def keys_like(link: Session, expression: str) -> str:
 
 
 def readable(sample: ReceivedSample) -> Any:
-    """Return a message as JSON values; one outside the contract as its MessagePack value, or why it is refused."""
+    """Return a message as JSON values; if it cannot be decoded, its MessagePack value, or else why it is refused."""
     try:
         return _plain(messages.decode(sample.key, sample.payload))
     except DecodeError as error:
@@ -284,7 +284,7 @@ def _map(name: str, text: str, example: str) -> dict[str, Any]:
 
 
 def ask(link: Session, key: str, op: str, text: str) -> Any:
-    """Send a request with arguments in a JSON text; return the result as JSON values, or raise the refusal."""
+    """Send a request with arguments in a JSON text; return the result as JSON values; errors as in `result_of`."""
     _refuse_wildcards(key, "ask")
     result = result_of(link.request(key, op, ASK, _map(f"{op}: args", text, '{"gates": 50}')))
     with suppress(DecodeError):  # only the result of a replay contains messages

@@ -40,8 +40,8 @@ ABOUT_S = 20.0  # wall time for a probe to report; a small computer takes 5 s to
 READY_S = 20.0  # wall time for a probe to listen, which includes importing numpy
 REACH_S = 60.0  # wall time to measure a path; 9 pings and at most 9 bulk transfers take 40 s at a round trip of 2 s
 NO_MODULE = "no module named"  # part of Python's error, in lower case
-NO_PROGRAM = ("not found", "no such file")  # parts of shells' errors on a missing program, in lower case
-NO_PROGRAM_CODES = (126, 127)  # shells' exit codes for a missing program; POSIX, 2.8.2
+NO_PROGRAM = ("not found", "no such file")  # parts of shells' errors for a missing program, in lower case
+NO_PROGRAM_CODES = (126, 127)  # shells' exit codes for a program that cannot be run or is missing; POSIX, 2.8.2
 NEEDED_TO_COMPUTE = "scipy"  # a host without it runs only routers and recorders; world and agents need it
 OFFSET_SAMPLES = 3  # clock readings; the one with the shortest round trip gives the best estimate of the offset
 HOST_COLUMNS = (
@@ -98,7 +98,7 @@ class HostReport(NamedTuple):
     facts: dict[str, Any]
     round_trip_s: float
     clock_offset_s: float  # the host's wall clock minus that of this machine, accurate to half the round trip
-    remedy: str = "run `zsim push --hosts FILE`"  # how to install another zsim there
+    remedy: str = "run `zsim push --hosts FILE`"  # how to install the right zsim there
 
 
 class NetworkPath(NamedTuple):
@@ -109,7 +109,7 @@ class NetworkPath(NamedTuple):
 
 
 class CheckResult(NamedTuple):
-    """Tables on the hosts and the network paths; faults and warnings, one line each."""
+    """Tables of the hosts and the network paths; faults and warnings, one line each."""
 
     tables: list[FittedTable]
     faults: list[str]
@@ -224,7 +224,7 @@ def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str
 
 
 def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
-    """Yield a warning if the fingerprints differ, with the parts that cause it."""
+    """Yield a warning if the fingerprints differ, naming the parts that do."""
     fingerprints = {name: report.facts["fingerprint"] for name, report in reports.items()}
     if len(set(fingerprints.values())) < 2:
         return
@@ -238,7 +238,7 @@ def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
 
 
 def _lacked_packages(reports: dict[str, HostReport]) -> Iterator[str]:
-    """Yield a warning for each host that lacks a package that others compute with: slower, but with the same bits."""
+    """Yield a warning for each host without a package that others compute with: it is slower, with the same results."""
     for name, report in reports.items():
         all_parts = {part for each in reports.values() for part in each.facts["machine"]}
         if lacking := " and ".join(sorted(all_parts - set(report.facts["machine"]))):

@@ -132,7 +132,8 @@ class HostLink:
         """
         async with self.channel(retry) as connection:
             try:
-                done = await asyncio.wait_for(connection.run(command, input=stdin, encoding=None), timeout_s)
+                async with asyncio.timeout(timeout_s):
+                    done = await connection.run(command, input=stdin, encoding=None)
             except TimeoutError as error:
                 description = what or repr(command[:60])
                 raise HostsError(f"{self.name}: no answer within {timeout_s:g} s ({description})") from error
@@ -148,7 +149,7 @@ class HostLink:
     async def put_files(
         self, folder: str, files: Mapping[str, bytes], timeout_s: float = ANSWER_S, retry: bool = False
     ) -> None:
-        """Write files, given by path below a folder, readable by their owner alone.
+        """Write files, given by path below a folder, readable only by their owner.
 
         Raise HostsError if they cannot be written; if the link breaks, no file is written.
         """
@@ -189,7 +190,8 @@ class HostLink:
             connection.close()
         closed = asyncio.gather(*(each.wait_closed() for each in self._channels), return_exceptions=True)
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(closed, CLOSE_S)
+            async with asyncio.timeout(CLOSE_S):
+                await closed
 
 
 def _broken(name: str, error: Exception) -> HostsError:
@@ -202,9 +204,8 @@ class HostLinks:
     def __init__(self, inventory_file: InventoryFile, names: Iterable[str], loop: EventLoopThread) -> None:
         self._inventory_file = inventory_file
         self._loop = loop
-        self.by_name = {
-            name: self.to(name) for name in names
-        }  # replaced, never modified, because other threads read it
+        # replaced, never modified, because other threads read it
+        self.by_name = {name: self.to(name) for name in names}
 
     def to(self, name: str) -> HostLink:
         """Return a new link to a host of the inventory, without adding it."""
@@ -227,7 +228,8 @@ class HostLinks:
 
         async def bounded(link: HostLink) -> Any:
             try:
-                return await asyncio.wait_for(work(link), within_s)
+                async with asyncio.timeout(within_s):
+                    return await work(link)
             except TimeoutError as error:
                 reason = f"not done within {within_s:g} s; is the link slow or the host busy?"
                 raise HostsError(f"{link.name}: {reason}") from error
@@ -313,13 +315,14 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
     part, moved = into.with_name(f"{into.name}.part"), asyncio.Event()
     try:
         async with link.channel() as connection:
-            sftp = await asyncio.wait_for(start_sftp(link.name, connection), OPEN_S)
+            async with asyncio.timeout(OPEN_S):
+                sftp = await start_sftp(link.name, connection)
             copy = asyncio.create_task(
                 sftp.get(
                     source.removeprefix("~/"), part, block_size=BLOCK_BYTES, progress_handler=lambda *_: moved.set()
                 )
             )
-            copy.add_done_callback(lambda task: task.cancelled() or task.exception())  # or else asyncio reports it
+            copy.add_done_callback(lambda task: task.cancelled() or task.exception())  # otherwise asyncio reports it
             try:
                 while not (await asyncio.wait([copy], timeout=STALL_S))[0]:
                     if not moved.is_set():
@@ -352,7 +355,7 @@ async def start_sftp(name: str, connection: Connection) -> asyncssh.SFTPClient:
 
 
 def shell_word(path: str) -> str:
-    """Quote a path as one word for a shell; a leading ~/ still stands for the home of the user there."""
+    """Quote a path as one word for a host's shell, which still expands a leading ~/ to the user's home folder."""
     return f"~/{shlex.quote(path[2:])}" if path.startswith("~/") else shlex.quote(path)
 
 
@@ -398,14 +401,16 @@ async def connect(name: str, host: Host, base: Path) -> Connection:
             known_hosts = base / Path(host.known_hosts).expanduser()
             options["known_hosts"] = str(known_hosts)
         opening = asyncssh.connect(address, host.port, client_factory=lambda: client, **options)
-        return await asyncio.wait_for(opening, CONNECT_S)
+        async with asyncio.timeout(CONNECT_S):
+            return await opening
     except (asyncssh.Error, asyncssh.KeyImportError, OSError, ValueError, TimeoutError) as error:
         refused = client.refused
         if refused is None and isinstance(
             error, asyncssh.ConnectionLost | asyncssh.KeyExchangeFailed | ConnectionResetError
         ):  # perhaps no host key algorithm was agreed on: only those in known_hosts are offered
             with contextlib.suppress(asyncssh.Error, OSError, ValueError, TimeoutError):
-                key = await asyncio.wait_for(asyncssh.get_server_host_key(address, host.port), CONNECT_S)
+                async with asyncio.timeout(CONNECT_S):
+                    key = await asyncssh.get_server_host_key(address, host.port)
                 refused = (address, "", host.port, key) if key else None
         reason = _changed_key(name, host, known_hosts, *refused) if refused else ""
         raise HostsError(f"{name}: {reason or _reason(name, host, base, known_hosts, error)}") from error
@@ -414,7 +419,7 @@ async def connect(name: str, host: Host, base: Path) -> Connection:
 def _changed_key(
     name: str, host: Host, known_hosts: Path, searched_name: str, address: str, port: int, host_key: asyncssh.SSHKey
 ) -> str:
-    """Return a text on a host key that differs from the known one; empty if it does not, or none is known."""
+    """Return a text about a host key that differs from the known one; empty if it does not, or none is known."""
     path = str(known_hosts.expanduser())
     try:
         keys = asyncssh.match_known_hosts(path, searched_name, address, None if port == SSH_PORT else port)[0]

@@ -1,7 +1,7 @@
 """A run on several hosts: checks and prepares them, starts the processes over ssh, supervises them, fetches the record.
 
 The requests of `zsim ps`, `logs`, `restart`, `move` and `down` are carried out here, each in a thread of the control
-socket. A `HostPlan` holds the host, command line and files of each process.
+socket. A `HostPlan` determines the host, command line and files of each process.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ from zsim_deploy.roles.stop_channel import FOLDER
 CONNECT_S = 30.0  # time limit for logging in to all hosts
 CHECK_S = 60.0  # for checking all hosts; a small computer imports numpy in 5 s, a poor link adds a dozen round trips
 PREPARE_S = 30.0  # for copying files to all hosts
-CLEAN_S = 5.0  # for a host to remove the run's folder; a lost host delays the end by no more than this
+CLEAN_S = 5.0  # for a host to remove the run's folder; a lost host delays the end by at most twice this
 JOIN_S = 60.0  # for connecting and checking a host that the run has not used so far
 IMPORT_S = 20.0  # for a Python to import the modules of a role; a small computer takes 5 s
 BRING_S = 30.0  # for copying a certificate to a host
 LEAVE_S = 20.0  # for a process that was just replaced to end; normally it takes a second
-LOOK_S = 0.1  # polling interval of that end
+LOOK_S = 0.1  # polling interval while waiting for that end
 ORDER_S = 5.0  # time limit for the supervisor, which polls every 50 ms, to carry out an order
 BEAT_S = 1.0  # interval of the launcher's heartbeat
 ORPHAN_S = 60.0  # without a heartbeat for this long, a process ends itself; shorter link outages are survived
@@ -129,7 +129,7 @@ class HostRun:
 
     def _check(self) -> None:
         async def inspect(link: HostLink) -> tuple[HostReport, list[str], list[str]]:
-            """Return the report of a host, faults of its ports, and lines on what earlier runs have left there."""
+            """Return the report of a host, faults of its ports, and lines about what earlier runs have left there."""
             python = self._plan.python(link.name)
             report = await host_report(link, python, self._inventory_file.shell_path)
             port_lines = await port_faults(link, python, self._plan.ports(link.name))
@@ -343,7 +343,7 @@ class HostPlan:
         return f"{runs_folder(self.inventory_file.inventory.hosts[host])}/{self._run_id}"
 
     def keys(self, host: str) -> str:
-        """Return the folder on a host that holds the private keys of this run's processes."""
+        """Return the folder of the private keys of this run's processes on a host."""
         return f"{self.folder(host)}/{FOLDER}"
 
     def endpoint(self) -> str:
@@ -418,7 +418,7 @@ class RemoteProcess:
     (roles/stop_channel.py).
 
     Args:
-        on_line: takes every line of its standard output; None: these lines go to the log as well.
+        on_line: called with each line of its standard output; None: standard output goes to the log too.
         files: a folder on the host, and the contents of the files that the process needs, by path below that folder.
             The process removes its key when it ends, so each restart copies the files again.
     """
@@ -529,7 +529,7 @@ class RemoteProcess:
         return self._log.last
 
     def request_stop(self, reason: str) -> None:
-        """Ask the process to stop; the request is kept while the process is starting, and void once it has ended."""
+        """Ask the process to stop; the request is kept while it is starting, and has no effect once it has ended."""
         self._stop = reason
         self._loop.call_soon(self._send, f"stop {reason}\n")
 

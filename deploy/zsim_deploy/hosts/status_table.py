@@ -84,7 +84,7 @@ class StatusTable(Screen):
             super().clock(line)
 
     def health(self, line: dict[str, Any]) -> None:
-        """Store the health of a process; its message rate follows from the previous health."""
+        """Store the health of a process, with its message rate since the previous health."""
         now_s = time.monotonic()
         previous = self._health.get(line["name"])
         rate = None
@@ -138,7 +138,7 @@ class StatusTable(Screen):
     def _no_sign_s(self, name: str, round_trip_s: float) -> float:
         """Return how long a process has been silent [s, wall]; 0 if that is not unusually long.
 
-        The health of all other processes arrives through the world; while it is silent, only the world is reported.
+        The health of all other processes arrives through the world; while the world is silent, only that is reported.
         """
         now_s, patience_s = time.monotonic(), SILENT_PROCESS_S + ROUND_TRIPS * round_trip_s
         heard_s = self._health[name]["wall_s"] if name in self._health else None

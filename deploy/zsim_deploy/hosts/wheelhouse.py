@@ -2,7 +2,7 @@
 
 CACHE/wheels/*.whl           wheels of other projects, for all hosts
 CACHE/build/*.whl            wheels of this project's build requirements, for this machine
-CACHE/houses/KEY.json        names of the wheels for one kind of host and its extras; KEY is a hash of these
+CACHE/houses/KEY.json        names of the wheels for a kind of host; KEY is a hash of its target, extras and versions
 CACHE/zsim/KEY/zsim-*.whl    wheel of this project; KEY is a hash of its sources
 """
 

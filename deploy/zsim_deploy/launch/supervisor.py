@@ -101,7 +101,7 @@ class Supervisor:
         self._silent_s: float | None = None  # monotonic time at which a world without any output is reported
         self._dead: set[str] = set()
         self._lost: dict[str, int | None] = {}  # pid of each process that ended without a bye message, by name
-        self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and when [s; monotonic]
+        self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and since when [s; monotonic]
         self._left: list[RunProcess] = []  # replaced processes that have ended or were killed
         self._world_watch = WorldWatch()
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
@@ -144,7 +144,7 @@ class Supervisor:
             rows.append(status_row(child.name, socket.gethostname(), child.pid, state, child.restarts))
         return rows
 
-    # Lines of the world
+    # Output of the world
 
     def handle_line(self, text: str) -> None:
         kind, content = JsonProgress.read(text)
@@ -364,7 +364,7 @@ class DeathPolicy:
         action = on_death(processes.on_death, name)
         if action == "end":
             return DeathDecision("end", "on_death: end")
-        is_settled = flies and (action == "wait" or lets_drop(processes.on_death, name))  # the scenario's choice stands
+        is_settled = flies and (action == "wait" or lets_drop(processes.on_death, name))  # the scenario decides
         ends, reason = False, ""
         if code == USER_FAULT and not is_settled:
             ends, reason = is_needed(name), "a restart would not help"

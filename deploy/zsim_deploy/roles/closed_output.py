@@ -72,7 +72,7 @@ def is_unread(stream: int) -> bool:
 
 
 def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOSED) -> None:
-    """Redirect further output, except of streams that write to a file, to the file `log`; drop it if that fails."""
+    """Redirect further output, except that of streams writing to a file, to the file `log`; drop it if that fails."""
     try:
         into, where = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), f"goes to {log}"
     except OSError as error:

@@ -247,7 +247,7 @@ def serve_runs(
     """Serve the runs of the world on an endpoint, one after another, until stopped; a launched process serves only one.
 
     Args:
-        name: name of the process; `role.*`: the role with the first free number, until another process takes that over.
+        name: name of the process; `role.*`: the role with the first free number, or the next if that is taken over.
         stands_for: returns the names of the processes that this one replaces in a run.
         slack_ns: returns how far the world of a run may be ahead of this process; 0 if the world does not wait for it.
         remain: called after the run, if the process was launched.
@@ -376,7 +376,7 @@ def process_name(role: str, name: str, identity: Identity, thing: str = "main") 
 
 
 def check_certificate(member: Agent, identity: Identity) -> None:
-    """Raise RunError if the certificate does not cover all messages of an agent; the others would be lost silently."""
+    """Raise RunError if the certificate does not cover all messages of an agent; the rest would be lost silently."""
     if not identity.tls:
         return
     if member.serves:

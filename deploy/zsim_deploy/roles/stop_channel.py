@@ -1,10 +1,10 @@
 """How a process is stopped: by a signal, by its launcher, or because the launcher has died.
 
 The standard input of a launched process is a pipe from its launcher. The launcher writes "stop REASON"; when it dies,
-the pipe closes. So no process outlives its launcher, on any system, even after kill -9. A launcher on another host
+the pipe closes. Thus no process outlives its launcher, on any system, even after kill -9. A launcher on another host
 writes "orphan-after SECONDS" and then a "beat" every second, because the loss of a host closes no pipe. A launched
-process that receives SIGTERM also ends in an orderly way, but counts as dead, because its launcher did not request
-that.
+process that receives SIGTERM also ends in an orderly way, but is treated as dead, because its launcher did not
+request that.
 
 A process that ends removes the private key that `zsim up` has copied to its host. This module also has
 `lower_priority`, for processes that no gate waits for.
@@ -31,7 +31,7 @@ REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTER
 HANGUP = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()  # not on Windows
 TWICE_INTERRUPTED = "interrupted twice, ended without waiting"
 TERMINATED = 128 + signal.SIGTERM  # exit code after SIGTERM, as in shells
-GRACE_S = 4.0  # wall time to end after the launcher's loss, then killed; or to heed a request to stop, then interrupted
+GRACE_S = 4.0  # wall time to end after the launcher is lost, before being killed; to heed a stop, before an interrupt
 FOLDER = "identity"  # folder of certificates, in the folder of a run on a host
 NICE = 5  # nice value of processes that no gate waits for
 AUTOGROUP = Path("/proc/self/autogroup")  # sched(7)
@@ -40,11 +40,11 @@ AGAIN_S = 0.12  # wall time between attempts; the kernel allows all ordinary use
 
 
 class StopChannel:
-    """Receives the request to stop a process, and holds its reason.
+    """Receives the request to stop a process, and stores its reason.
 
     Args:
         launched: id of the run for which a launcher started the process; standard input is then the pipe from the
-            launcher, to which Ctrl-C is left. None: started by hand.
+            launcher, and Ctrl-C is ignored, because the launcher handles it. None: started by hand.
         identity: identity of the process; a key copied here by the launcher is removed as soon as the launcher is lost.
         held_by: only for a process that itself runs a user's code; returns, for a frame of the main thread, which code
             is running. If `reason` is not called within GRACE_S of the request, or the user presses Ctrl-C again,
@@ -218,7 +218,7 @@ def interruptible() -> Iterator[None]:
 def lower_priority() -> None:
     """Give the world precedence: raise the nice value of this process, and that of its session if it leads one.
 
-    Where Linux schedules by session (autogroup), the nice values of processes count only within a session.
+    Where Linux schedules by session (autogroup), the nice values of processes apply only within a session.
     """
     if hasattr(os, "nice"):
         os.nice(NICE)

@@ -1,1 +1,1 @@
-"""The fleet of all drones, advanced gate by gate: kernel, injected faults, messages of a gate. Imports vehicles."""
+"""All drones of a scenario, advanced gate by gate: kernel, faults, messages. Imports physics, sensors and vehicles."""

@@ -28,6 +28,7 @@ class Impairment:
     Args:
         arrays: arrays of the fleet, as before its first gate.
         drones, vehicles: names and vehicles of the drones, in scenario order.
+        sensors: types and settings of the fleet's sensors.
         scans: sampler of the sensors that cast rays; None if no drone has any.
 
     Attributes:
@@ -77,7 +78,7 @@ class Impairment:
         self._gusts = tuple(fault for fault in acting if fault.kind == "gust")
 
     def blow(self, from_ns: int, until_ns: int) -> None:
-        """Set the wind between two instants: the steady wind plus the gusts."""
+        """Set the wind between two instants: the steady wind plus the gusts halfway between them."""
         if self._calm and not self._gusts:
             return
         at_ns = (from_ns + until_ns) // 2

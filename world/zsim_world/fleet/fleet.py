@@ -2,7 +2,7 @@
 
 An external drone also has a row in the arrays, for collisions and downwash; its pose is set, not integrated. Its driver
 publishes a pose from time to time. Between poses, the drone moves on at the published velocity until the pose is too
-old; then it stands still.
+old; then it stops there.
 
 Heights: the altitude_m of `baro` is the height above the origin of W (zeroed on site, as the aircraft does at
 power-up), and its pressure_pa is that of the standard atmosphere at `environment.height_m` + altitude_m.
@@ -336,7 +336,7 @@ class Fleet:
     def set_ardrone(
         self, i: int, forward: float, left: float, up: float, yaw_left: float, hover: bool = False
     ) -> str | None:
-        """Fly by tilt, climb and yaw rate, relative to their limits in [-1, 1], or hover; return why it is refused."""
+        """Fly by tilt, climb and yaw rate as shares of their limits (-1 to 1), or hover; return why it is refused."""
         return self._set(i, firmware.HOVER if hover else firmware.ARDRONE, (forward, left, up, yaw_left))
 
     def set_attitude(self, i: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float = 0.0) -> str | None:
@@ -512,7 +512,7 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
         anchor[i] = np.array(drone.position_m[:2]) + linear.product(contact_points(row[i])[:, :2], turn.T)
     aero = np.array([aero_row(drone, scenario.environment) for drone in drones])
     external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
-    pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)  # found in the first tick: no drone is at its origin
+    pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)  # found in the first tick, as `origin` is infinite
     eye = np.array([_look_down(drone) for drone in drones])
     number, above = np.zeros(1, dtype=np.int64), np.zeros(n, dtype=np.int8)
     near = NearPairs(pair=pairs, number=number, origin=np.full((n, 3), np.inf), above=above, eye=eye)

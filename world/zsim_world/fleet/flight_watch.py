@@ -21,10 +21,10 @@ from zsim_world.vehicles.firmware import EMERGENCY, FLYING, HOVERING, LANDING, M
 from zsim_world.vehicles.observer import STEP_S
 
 IMPACT_STEPS = 4  # steps over which a change of velocity is measured: 20 ms, about half of a foot contact
-IMPACT_G = 5.0  # mean over these steps; design choice: twice what rotors and drag cause; a fall from 0.4 m reaches it
+IMPACT_G = 5.0  # mean acceleration over them; design choice: twice what rotors and drag cause; a 0.4 m fall reaches it
 IMPACT_M_S = IMPACT_G * G_M_S2 * IMPACT_STEPS * STEP_S  # m/s, largest change of velocity without an impact
-RIGHTED_COSINE = 0.5  # cosine of 60 deg of tilt; design choice: well below 90 deg, so that one flip counts once
-QUIET_STEPS = round(1.0 / STEP_S)  # design choice: contacts within 1 s of an impact count as its bounces
+RIGHTED_COSINE = 0.5  # cosine of 60 deg of tilt; design choice: well below 90 deg, so that a flip is reported once
+QUIET_STEPS = round(1.0 / STEP_S)  # design choice: contacts within 1 s of an impact are taken as bounces
 MODE, FLIP, IMPACT, EMPTY, TOUCHDOWN = 1, 2, 4, 8, 16  # incident bits of a drone
 NOTHING, GROUND, FIRST_OBSTACLE = 0, 1, 2  # what a drone touches; from FIRST_OBSTACLE on: obstacles, surfaces, drones
 

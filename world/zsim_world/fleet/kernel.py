@@ -1,4 +1,4 @@
-"""The kernel: one gate of all drones, a pure function of its arrays.
+"""The kernel: advances all drones by one gate; it reads and writes nothing but its arrays.
 
 In every physics tick, in this order: the firmware (every 5 ms) reads the newest samples and commands the rotors; the
 drones are integrated, and the poses of external ones set; gusts advance and batteries drain (every 5 ms); contacts with

@@ -115,7 +115,7 @@ class GatePublication:
         self.counts = np.zeros((fleet.count, len(self.table) // fleet.count), dtype=np.int64)
         rotors = np.array(fleet.rotors, dtype=np.int64)
         own_messages = np.array([0 if i in fleet.external else OWN_MESSAGES for i in range(fleet.count)])
-        self._first = int(np.argmax(own_messages))  # a drone whose status numbers the gates
+        self._first = int(np.argmax(own_messages))  # a drone whose status has the number of the gate as `seq`
         self._own_count = int(own_messages.sum())
         sigmas_m = np.array(fleet.gps_sigma_m)
         self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, self.counts, rotors, own_messages)

@@ -1,4 +1,4 @@
-"""Which drones receive which others at a gate, from the scenario's topology and radio, and the true positions."""
+"""Determines which drones hear which others at a gate, from the scenario's topology, its radio and true positions."""
 
 from collections.abc import Iterable
 

@@ -244,6 +244,20 @@ async def test_a_subscriber_receives_type_and_definition(graph) -> None:
     assert "MSG: geometry_msgs/Vector3" in header["message_definition"]
 
 
+@pytest.mark.parametrize("turns", range(6))  # of the loop, between the header's arrival and the cancellation
+@in_loop
+async def test_a_cancellation_counts_even_while_a_header_arrives(turns) -> None:
+    reader = asyncio.StreamReader()
+    reading = asyncio.create_task(wire.read_header(reader))
+    await asyncio.sleep(0.01)
+    reader.feed_data(wire.encode_header({"topic": "/t"}))
+    for _ in range(turns):
+        await asyncio.sleep(0)
+    was_running = reading.cancel()
+    await asyncio.wait([reading])
+    assert reading.cancelled() == was_running
+
+
 @pytest.mark.parametrize(
     ("header", "terms"),
     [

@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import asyncssh
@@ -45,6 +46,28 @@ def connections(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 def link() -> HostLink:
     return HostLink("h1", Host(address="127.0.0.1"), Path())
+
+
+@pytest.mark.parametrize("turns", range(6))  # of the loop, between the answer and the cancellation
+def test_a_cancellation_counts_even_while_a_command_ends(connections: list[Any], turns: int) -> None:
+    async def cancel_near_the_end() -> bool:
+        host, ended = link(), asyncio.Event()
+
+        async def command(*_: Any, **__: Any) -> SimpleNamespace:
+            await ended.wait()
+            return SimpleNamespace(exit_status=0, stdout=b"")
+
+        (await host.open()).run = command
+        running = asyncio.create_task(host.run("true"))
+        await asyncio.sleep(0.01)
+        ended.set()
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        was_running = running.cancel()
+        await asyncio.wait([running])
+        return running.cancelled() == was_running
+
+    assert asyncio.run(cancel_near_the_end())
 
 
 def test_channels_are_spread_over_connections_and_reused(connections: list[Any]) -> None:

@@ -536,6 +536,12 @@ class Opaque(Counter):
         return self.state
 
 
+def tree_within_itself() -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    tree["parent"] = [tree]
+    return tree
+
+
 @pytest.mark.parametrize(
     ("state", "terms"),
     [
@@ -543,7 +549,9 @@ class Opaque(Counter):
         ({"a": {"b": [1, {"c": 1j}]}}, ("a.b[1].c", "complex")),
         ({3: 1}, ("map", "name")),
         ({"seen": np.array(["x"])}, ("seen", "<U1")),
-        ({"big": 1 << 70}, ("big", "int")),
+        ({"big": 1 << 70}, ("big", "int", "64 bits")),
+        ({"a": {1 << 70: 1}}, ("a", "key", "int", "64 bits")),
+        ({"count": 1, "tree": tree_within_itself()}, ("tree", "nested")),
         ([1, 2], ("[1, 2]",)),
     ],
 )
