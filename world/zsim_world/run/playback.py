@@ -120,7 +120,7 @@ class Playback(Coordinator):
         if self._coming is None or (played.to_ns is not None and self._coming.t_ns > played.to_ns):
             until = "on" if played.to_ns is None else f"to {played.to_ns / 1e9:.12g} s"
             window = f"from {played.from_ns / 1e9:.12g} s {until}"
-            raise RecordError(f"{reader.path}: holds no gate {window}; nothing can be played")
+            raise RecordError(f"{reader.path}: contains no gate {window}; nothing can be played")
 
     def info(self) -> messages.Info:
         """Return the recorded `world/info`, adapted to the replay."""
