@@ -152,7 +152,7 @@ class Run:
         return self._read_leaf("cluster", self._cluster(cluster), "state")
 
     def messages(self, key: str) -> "DataFrame":
-        """Return all messages of a key, with `t_ns`, `seq`, and `wall_ns`, the time of recording [ns since 1970].
+        """Return all messages of a key, with `t_ns`, `seq` and `wall_ns`, the time of recording [ns since 1970].
 
         Messages of a program of your own have a column for each field.
 

@@ -63,7 +63,7 @@ def make_directory(out: Path | None, scenario: Scenario, force: bool = False) ->
 
 @contextmanager
 def locked(folder: Path) -> Iterator[Path]:
-    """Yield a run's folder, locked until the block is left, so that no other run, even of this process, flies into it.
+    """Yield a run's folder, locked until the block is left, so that no other run, even of this process, uses it.
 
     A run has no file that exists from the beginning, so the folder itself is locked. NFS and Windows cannot lock
     folders; there, the locks of record and journal must suffice.

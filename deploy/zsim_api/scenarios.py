@@ -26,7 +26,7 @@ class Scenario:
         zsim.Scenario.load("step.yaml").with_({"environment.wind.gust_m_s": 1.0}, seed=3)
         zsim.Scenario(name="pair", duration_s=20, drones=[{"name": "drone1", "position_m": [0, 0, 0]}])
 
-    It is checked as a whole when it is flown, or by `resolved`.
+    It is checked as a whole when it is flown, or when `resolved` is read.
 
     Args:
         fields: top-level fields, with maps and lists as in YAML; docs/scenario.md lists them all.

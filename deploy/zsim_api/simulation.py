@@ -127,7 +127,7 @@ class Simulation:
     def reset(self, seed: int | None = None, set: Mapping[str, Any] | None = None) -> Truth:
         """Start a new flight; return its initial state; raise RunError if the flight is recorded.
 
-        Agents given as objects get back the attributes that they had initially.
+        Agents given as objects get their initial attributes back.
 
         Args:
             seed: for this and later flights; None: as before.

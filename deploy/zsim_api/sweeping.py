@@ -1,4 +1,4 @@
-"""Flies a scenario many times with different seeds and values of its fields: `zsim.sweep` and `zsim sweep`."""
+"""Flies a scenario many times with different seeds and field values: `zsim.sweep` and `zsim sweep`."""
 
 import json
 import re

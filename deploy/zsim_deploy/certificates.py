@@ -174,7 +174,7 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write a file atomically, readable by its owner alone."""
+    """Write a file atomically, readable only by its owner."""
     temporary = path.with_name(f".{path.name}.new")
     with file_fault(path, "cannot be written", "give another folder"):
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -405,7 +405,7 @@ _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
 # Declarations may go to every named process, which would otherwise send nothing; they have no payload.
 _DECLARATIONS = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
 _MESSAGES = (*_DECLARATIONS, "put", "delete", "query", "reply", "liveliness_token")
-ANYONE = "anyone"  # any peer with a certificate of the authority: a subject without conditions matches all
+ANYONE = "anyone"  # any peer with a certificate of the authority, because a subject without conditions matches all
 # Any peer may query its own rights; see zsim.transport.tls.
 _ACCESS_QUERY = (("ingress", "query"), ("egress", "reply"))
 

@@ -37,7 +37,7 @@ EXAMPLE = "examples/hosts.yaml"  # suggested if the inventory file is missing
 ZENOH_PORT = 7447  # default port of Zenoh
 SSH_PORT = 22  # IANA
 HOSTS_MAX = DRONES_MAX  # with more, some hosts would have no drone
-ROLES_MAX = PROCESSES_MAX  # each entry stands for at least one process
+ROLES_MAX = PROCESSES_MAX  # each entry matches at least one process
 ROUTER_PORT = 7448  # differs from ZENOH_PORT, for a world on the same host
 MODULE = (SAFE_PATH, "-m", "zsim_deploy.cli")  # arguments for the Python interpreter
 EXTRAS_BY_NAME = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # extras by process name, in placement order
@@ -384,7 +384,7 @@ def local_programs(inventory_file: InventoryFile, scenario: Scenario) -> list[st
 
 
 def _command_text(name: str, scenario: Scenario, endpoint: str) -> str:
-    """Return a scenario program's command line, empty for others; the user replaces `{folder}` by the run's folder."""
+    """Return a scenario program's command line, empty for others; the user replaces `{folder}` with that of the run."""
     if name not in scenario.own_programs:
         return ""
     values = {"endpoint": endpoint, "federation": scenario.federation, "name": name, "folder": "{folder}"}

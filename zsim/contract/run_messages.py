@@ -51,7 +51,10 @@ def waiting_text(state: str, waiting: Sequence[Waiting]) -> str:
 
 @on("clock", writers="world", readers="each", last="world")
 class Clock(Message, frozen=True):
-    """The newest gate of the world, and the measured rate of time. `waiting_for` is filled while time is stopped."""
+    """The newest gate of the world, and the measured rate of time.
+
+    `waiting_for` names the processes that the world waits for; in realtime, those that are dead, silent or away.
+    """
 
     run_id: str
     step: Count

@@ -323,7 +323,7 @@ def gateway(
     ] = None,
     name: Annotated[str, opt.process_option("gateway.main")] = "",
 ) -> None:
-    """Serve MATLAB, Octave, C, JavaScript and scripts by JSON lines, WebSocket and REST."""
+    """Serve MATLAB, Octave, C, JavaScript and scripts over JSON lines, WebSocket and REST."""
     require("gateway", GATEWAY_NEEDS)
     from zsim.transport.connection import find_world
     from zsim.transport.zenoh_settings import SERVER_FILES, allow_files, require_files
@@ -640,7 +640,7 @@ def fmu(
         ),
     ] = "",
 ) -> None:
-    """Run an FMU of Simulink, Modelica, Dymola or pythonfmu as a controller or an estimator."""
+    """Run an FMU from Simulink, Modelica, Dymola or pythonfmu as a controller or an estimator."""
     require("fmu", FMU_NEEDS)
     from zsim_bridges.fmu.agent import Fmu
     from zsim_deploy.roles import roles

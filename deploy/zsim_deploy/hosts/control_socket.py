@@ -1,4 +1,4 @@
-"""The local socket by which `zsim ps`, `logs`, `restart`, `move` and `down` reach the launcher on this machine.
+"""The local socket through which `zsim ps`, `logs`, `restart`, `move` and `down` reach the launcher on this machine.
 
 A connection carries one request and one answer, a JSON line each: {op, args} and {ok, error, result}.
 """
@@ -61,7 +61,7 @@ def launchers() -> list[str]:
 def ask(federation: str, op: str, **args: Any) -> Any:
     """Send a request to a federation's launcher on this machine, and return the result.
 
-    Raise RunError if no launcher runs, or if it does not answer or refuses the request.
+    Raise RunError if no launcher is running, or if it does not answer or refuses the request.
     """
     path = place(federation)
     with socket.socket(socket.AF_UNIX) as line:
@@ -101,7 +101,7 @@ class ControlSocket:
         actions: function for each `op`; called in a thread with the request's arguments, it returns a JSON value.
 
     Raises:
-        RunError: another launcher of the federation runs here, or no socket can be opened.
+        RunError: another launcher of the federation is running here, or no socket can be opened.
     """
 
     def __init__(self, federation: str, actions: dict[str, Act]) -> None:

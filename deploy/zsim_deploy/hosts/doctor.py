@@ -31,7 +31,7 @@ from zsim_deploy.hosts.host_link import (
 from zsim_deploy.inventory import SSH_PORT, Host, InventoryFile
 from zsim_deploy.roles.stop_channel import FOLDER
 
-CLOCK_OFFSET_MAX_S = 1.0  # logs remain comparable; certificates are back-dated by a day, messages carry simulated time
+CLOCK_OFFSET_MAX_S = 1.0  # logs stay comparable; certificates are back-dated by a day, messages carry simulated time
 LOAD_MAX = 0.5  # load average per core; in lockstep a busy host slows down all others
 FREE_MIN_BYTES = 1_000_000_000  # about the size of a record of an hour with three drones
 BITS_PER_S_MIN = 10e6  # three drones in realtime send 2 Mbit/s to a recorder; lockstep runs as fast as the link allows
@@ -312,7 +312,7 @@ def runs_folder(host: Host) -> str:
 
 
 async def leftovers(link: HostLink, base: Path) -> list[str]:
-    """Return warnings about leftovers of earlier runs on a host: at most one on records and one on private keys.
+    """Return warnings about leftovers of earlier runs on a host: at most one about records and one about private keys.
 
     A greeting of the login shell is skipped. Raise HostsError if the host cannot be reached.
     """

@@ -92,8 +92,8 @@ class HostRun:
     def run(self) -> Outcome:
         """Fly the run to its end; however it ends, no process or key of the run is left on a host that can be reached.
 
-        Raise RunError if the federation already runs on this machine, and HostsError with a line for every fault of the
-        certificates, or else for every host that cannot take part.
+        Raise RunError if the federation is already running on this machine, and HostsError with a line for every fault
+        of the certificates, or else for every host that cannot take part.
         """
         requests = {
             "ps": lambda: {"rows": self._status.rows(), "clock": self._status.clock_now, **self._where()},

@@ -19,7 +19,7 @@ from zsim_deploy.launch.supervisor import status_row
 if TYPE_CHECKING:
     from zsim_deploy.hosts.host_link import HostLink
 
-FIRST_S = 1.0  # simulated time from which the run counts as flying
+FIRST_S = 1.0  # simulated time from which the run is reported as flying
 SILENT_S = 1.0  # wall time without an answer after which a host is shown as silent; it is probed twice a second …
 ROUND_TRIPS = 2.0  # … plus this many of its round trips, because over a slow link every answer takes long
 WAITED_S = 0.5  # wall time after which a wait for a process is shown; shorter waits are normal in lockstep

@@ -211,7 +211,7 @@ def requirements(project: Path) -> list[str]:
 
 
 def requirement(installed: importlib.metadata.Distribution) -> str:
-    """Return the requirement by which pip finds an installed distribution again: its origin, or its version."""
+    """Return the requirement with which pip finds an installed distribution again: its origin, or its version."""
     origin = json.loads(installed.read_text("direct_url.json") or "{}")  # PEP 610
     if "vcs_info" in origin:
         return f"{PROJECT} @ {origin['vcs_info']['vcs']}+{origin['url']}@{origin['vcs_info']['commit_id']}"

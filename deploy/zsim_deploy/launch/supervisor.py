@@ -28,7 +28,7 @@ END_S = 8.0  # time for the others to end after the world; the recorder may have
 WORLD_FIRST_S = 1.0  # time for the world to end the run after Ctrl-C
 INTERRUPT_S = 2.0  # time for all processes to end after Ctrl-C; zsim promises 3 s in all
 SILENT_S = 10.0  # time after which a world without output is reported; it starts in 1 s, and announces compilation
-QUIET_WORLD_S = 1.8  # time after which the world counts as silent; it writes its clock every second, even while waiting
+QUIET_WORLD_S = 1.8  # time after which the world is reported silent; it writes its clock every second, even if waiting
 TAKE_OVER_S = 60.0  # time after which a replaced process is killed; even a slow successor starts in half that time
 RESTART_WINDOW_S = 20.0  # period in which restarts of a process are counted
 OUTPUT_LOOK_S = 0.1  # interval between checks that the output is still read
@@ -259,7 +259,7 @@ class Supervisor:
             world.request_stop(self._reason)
 
     def _apply_on_death(self, child: RunProcess, flies: bool) -> OnDeath:
-        """Decide what follows the death of a process, and restart it if that is the decision."""
+        """Decide what follows the death of a process, and restart it if so decided."""
         action, reason = self._deaths.decide(child.name, child.code, flies)
         if child.role != "world" or action == "restart":
             self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; {reason}")
@@ -386,7 +386,7 @@ class DeathPolicy:
 class WorldWatch:
     """Detects that the world has fallen silent, which a stopped process cannot report itself.
 
-    The world does not count as silent before its first line, because it may be compiling.
+    The world is not reported silent before its first line, because it may be compiling.
     """
 
     def __init__(self) -> None:

@@ -57,7 +57,7 @@ from zsim_deploy.roles.stop_channel import StopChannel, lower_priority
 RUN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # run ids that may be part of a folder's name
 PATTERN = "*?["  # special characters of patterns; fnmatch
 ANY = "*"  # stands for a number in a process name
-TICK_S = 0.1  # interval at which a router checks whether it is stopped, wall time
+TICK_S = 0.1  # interval at which a router checks whether it must stop, wall time
 PROBE_S = 1.0  # interval at which a router that cannot connect upstream looks for the reason, wall time
 PAUSE_S = 0.2  # polling interval while a world whose run has ended waits for bye messages, wall time
 JOINS_MAX = 10_000  # maximum number of joins that a router remembers; limited because clients can invent names
@@ -308,7 +308,7 @@ def _serve(serve: Serve, link: Session, participant: Participant, info: Info, st
     try:
         serve(link, info, participant, stop.stopped, say)
     except ZsimError as error:
-        participant.leave(str(error).removeprefix(f"{name}: "))  # otherwise the world would count this process as dead
+        participant.leave(str(error).removeprefix(f"{name}: "))  # otherwise the world would report this process dead
         raise
     reason = participant.end_reason or stop.reason() or "stopped"
     participant.leave(reason)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from zsim_world.run.playback import PlaybackRange
 
 SHOWN_EVENTS = 2000  # maximum number of events shown per run, besides those of VITAL kinds; the record has all events
-HEALTH_PERIOD_S = 0.5  # minimum interval between lines on a process's health; the contract says 1 Hz, some send more
+HEALTH_PERIOD_S = 0.5  # minimum interval between lines about a process's health; the contract says 1 Hz, some send more
 VITAL = frozenset({"death", "doubled", "failure", "overdue", "end"})  # kinds of events that are always shown
 
 

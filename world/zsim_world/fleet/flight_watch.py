@@ -47,7 +47,7 @@ SEEN = columns(
 
 
 class Incident(NamedTuple):
-    """An incident of a drone, to be published as an event; `data` has its cause or numbers."""
+    """An incident of a drone, to be published as an event; `data` contains its cause or numbers."""
 
     drone: int
     kind: str

@@ -47,7 +47,7 @@ write = inlined(framing.write)
 
 
 class PublicationBuffers(NamedTuple):
-    """Room for M encoded messages."""
+    """Buffers for M encoded messages."""
 
     columns: NDArray[np.int64]  # (3, M): WHICH, STAMPS, ENDS
     first: NDArray[np.int64]  # (N + 1,), where the messages of each drone begin
@@ -122,7 +122,7 @@ class GatePublication:
         self._known: dict[str | None, int] = {None: COMMANDER}
         self._words = framing.text_table((*firmware.MODES, None))
         payloads = self._payloads()
-        self._user_room = 2 * len(payloads.data)  # bytes of messages that are encoded in Python
+        self._user_room = 2 * len(payloads.data)  # bytes reserved for messages encoded in Python
         self._make_room(16 * fleet.count)
         # Load or compile the functions that the first gate needs, without counting messages.
         uncounted = self._fleetwide._replace(counts=self.counts.copy())

@@ -25,7 +25,7 @@ class RadioChannel:
         scene: the obstacles and surfaces that block lines of sight.
 
     Raises:
-        ValueError: the scenario has neither a radio nor a topology.
+        ValueError: `scenario.radio_of_agents` is None.
     """
 
     def __init__(self, scenario: Scenario, scene: Scene) -> None:

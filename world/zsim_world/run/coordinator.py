@@ -43,7 +43,7 @@ class Coordinator(ABC):
 
     Attributes:
         needs_participants: whether the loss of a participant affects the run; False for a replay.
-        refused_queries: further keys, besides `world/control`, on which requests are refused.
+        refused_queries: keys other than `world/control` on which requests are received, but refused.
         external: names of the drones whose drivers publish sensors, truth and status.
         unpaced: names of the processes that step when a driver publishes, not at every gate.
         is_launched: whether a launcher started the run; otherwise users start each process.
@@ -173,7 +173,8 @@ class Coordinator(ABC):
         else:
             blocks = former.is_waited_for and former.is_missed
         if not is_known and not strangers.allows("join"):
-            refusal = Refusal("newcomers", f"beyond {STRANGERS_MAX} at once", "must wait: one may join each second")
+            allowed = f"must be <= {STRANGERS_MAX} at once, then one each second"
+            refusal = Refusal("the number of new processes", f"above {STRANGERS_MAX}", allowed)
         elif not blocks and not changes.allows(counted):
             refusal = too_many(name)
         else:

@@ -102,7 +102,8 @@ class Refusal(NamedTuple):
 
 def too_many(source: str) -> Refusal:
     """Return the refusal of a source that exceeds its budget."""
-    return Refusal(source or "source", f"beyond {CHANGES_MAX} changes at once", "must wait: one is allowed each gate")
+    where = f"the number of changes of {source}" if source else "the number of changes"
+    return Refusal(where, f"above {CHANGES_MAX}", f"must be <= {CHANGES_MAX} at once, then one each gate")
 
 
 class RefusalLog:

@@ -1,7 +1,7 @@
 """A replay: publishes the record of a run on its keys in place of a world.
 
-Otherwise it behaves as a world: it keeps time, waits for its participants, answers queries for last values, and can be
-paused, stepped and stopped. No drone can be flown.
+Otherwise it behaves like a world: it keeps time, waits for its participants, answers queries for last values, and can
+be paused, stepped and stopped. No drone can be flown.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def test_flight_changes_are_limited_with_one_more_allowed_per_gate(world: World)
     answers = [ask(world, op, drone="d1") for _ in range(FLOOD // 2) for op in ("acquire", "release")]
     done = [event for event in events(world) if event.data["ok"]]
     assert sum(answer.ok for answer in answers) == len(done) == CHANGES_MAX
-    assert has_terms(answers[-1].error, "me.x", str(CHANGES_MAX), "one", "gate")
+    assert has_terms(answers[-1].error, "me.x", str(CHANGES_MAX), "<=", str(CHANGES_MAX), "one", "gate")
     assert ask(world, "acquire", "other.x", drone="d1").ok
     assert ask(world, "release", "other.x", drone="d1").ok
     for _ in range(3):
@@ -157,6 +157,13 @@ def test_joins_of_newcomers_are_limited_over_all_names(world: World, period_ns: 
     leave(world, "console.0")
     join(world, "console.0", period_ns)
     assert kinds(world) == {"join": 3, "leave": 1}
+
+
+def test_the_refusal_of_a_newcomer_names_count_and_limit(world: World) -> None:
+    for number in range(STRANGERS_MAX + 1):
+        join(world, f"console.{number}")
+    last = events(world)[-1].text
+    assert has_terms(last, "number", "new", "processes", str(STRANGERS_MAX), "<=", str(STRANGERS_MAX), "one", "second")
 
 
 def test_one_more_newcomer_per_second_is_allowed_also_in_a_continued_run(world: World) -> None:
