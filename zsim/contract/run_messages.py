@@ -218,7 +218,8 @@ class ControlRequest(Struct, frozen=True):
 class ControlAnswer(Struct, frozen=True):
     """The answer to a request: whether it was carried out, the error if not, and the result.
 
-    `more` is the number of the next page of a replay; None if there is none."""
+    `more` is the number of the next page of a replay; None if there is none.
+    """
 
     ok: bool
     error: str = ""

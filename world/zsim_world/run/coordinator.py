@@ -483,7 +483,8 @@ class Coordinator(ABC):
     def must_wait_for(self, participant: Participant) -> bool:
         """Return whether a participant's first step may take any length of time.
 
-        It may if the process is unpaced, or if the scenario needs it and it replaced no living process."""
+        It may if the process is unpaced, or if the scenario needs it and it replaced no living process.
+        """
         if participant.served_names <= self.unpaced:
             return True
         return not participant.successor and not participant.served_names.isdisjoint(self._expected)

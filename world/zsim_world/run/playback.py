@@ -215,7 +215,8 @@ class Playback(Coordinator):
     def _publish(self, recorded: Recorded) -> None:
         """Publish a recorded message unchanged, except that events are renumbered and kills of processes left out.
 
-        The event `end` and `view/drones` are not published: the replay has its own."""
+        The event `end` and `view/drones` are not published: the replay has its own.
+        """
         key, payload = recorded.key, recorded.payload
         if key == keys.EVENT:
             with suppress(DecodeError):
