@@ -5,9 +5,9 @@ clones of past positions and velocities: the reading is compared with the clone 
 correct the present state. S. I. Roumeliotis, J. W. Burdick, "Stochastic cloning: a generalized framework for processing
 relative state measurements", IEEE International Conference on Robotics and Automation, 2002.
 
-The functions from `reckon` on implement dead reckoning: Madgwick's attitude filter, strapdown integration, and the
-growth of small errors. S. O. H. Madgwick, "An efficient orientation filter for inertial and inertial/magnetic sensor
-arrays", University of Bristol, 2010: quaternion rate (12), gravity's objective function (25), Jacobian (26), fusion (33).
+The functions from `reckon` on perform dead reckoning: Madgwick's attitude filter, strapdown integration, and growth of
+small errors. S. O. H. Madgwick, "An efficient orientation filter for inertial and inertial/magnetic sensor arrays",
+University of Bristol, 2010: quaternion rate (12), objective function of gravity (25), its Jacobian (26), fusion (33).
 Quaternions are Hamilton, w first, body to world; the world's z axis points up, so a body at rest feels +g along it.
 
 Errors of position and velocity are additive; the attitude error is a small rotation in the world frame,

@@ -611,8 +611,9 @@ def board(
     from zsim.runtime.progress import PipedConsole
 
     if papers:
-        if laws or scenarios or formats:
-            raise BadParameter("--papers flies no scenario; leave out --laws, --scenarios and --format")
+        given = {"--laws": laws, "--scenarios": scenarios, "--format": formats}
+        if useless := " and ".join(name for name, value in given.items() if value):
+            raise BadParameter(f"--papers flies no scenario; leave out {useless}")
         from zsim_analysis.board.papers import terminal_table, write_papers
 
         papers_folder = out or Path("runs") / "papers"

@@ -1,7 +1,7 @@
 """A replay: publishes the record of a run on its keys in place of a world.
 
-Otherwise it behaves as a world: it keeps time, waits for its participants, answers queries for last values, and can be
-paused, stepped and stopped. No drone can be flown.
+Otherwise it behaves like a world: it keeps time, waits for its participants, answers queries for last values, and can
+be paused, stepped and stopped. No drone can be flown.
 """
 
 from __future__ import annotations
@@ -215,7 +215,8 @@ class Playback(Coordinator):
     def _publish(self, recorded: Recorded) -> None:
         """Publish a recorded message unchanged, except that events are renumbered and kills of processes left out.
 
-        The event `end` and `view/drones` are not published: the replay has its own."""
+        The event `end` and `view/drones` are not published: the replay has its own.
+        """
         key, payload = recorded.key, recorded.payload
         if key == keys.EVENT:
             with suppress(DecodeError):

@@ -244,7 +244,7 @@ class Admission:
         self._trusts = trusts
         self._sessions: dict[str, Sessions] = {}  # by process, the sessions whose tokens have proved it
         self._withheld: dict[str, _Withheld] = {}
-        self._blocked_ns: dict[str, int] = {}  # how long processes lacking token or done have blocked the clock
+        self._blocked_ns: dict[str, int] = {}  # how long processes without a token or a done have blocked the clock
         self._look_wall_ns = 0
 
     def take(self, name: str, join: Join, wall_ns: int) -> None:
