@@ -13,7 +13,7 @@ import os
 import random
 import sys
 import time
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import msgpack
@@ -22,6 +22,8 @@ import zenoh
 ENDPOINT = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"
 ME, PAIR = "range.drone1", ("drone1", "drone2")
 PERIOD_NS, SIGMA_M = 200_000_000, 0.1
+START_S = 60.0  # wall time; the world may still be starting and compiling its kernel
+SILENCE_S = 10.0  # wall time; even while simulated time stands still, the world publishes its clock once a second
 
 
 def measure(truths: dict[str, dict[str, Any]], rng: random.Random) -> float:
@@ -37,6 +39,9 @@ class RangeSensor:
         self._session = session
         self._seq: dict[str, int] = {}
         info = world_info(session)
+        names = [drone["name"] for drone in info["drones"]]
+        if missing := [drone for drone in PAIR if drone not in names]:  # whose truth would never come
+            raise SystemExit(f"{ME}: {missing[0]} is not in the run; its drones are {', '.join(names)}")
         self._rng = random.Random(f"{info['seed']}/{ME}")  # a random stream of its own, reproducible from the seed
         self._run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
         self._inbox: SimpleQueue[zenoh.Sample] = SimpleQueue()
@@ -54,10 +59,14 @@ class RangeSensor:
         self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def run(self) -> int:
-        """Publish ranges until the run ends; return their number."""
+        """Publish ranges until the run ends; return their number.
+
+        Raises:
+            SystemExit: nothing came from the world for SILENCE_S.
+        """
         truths: dict[str, dict[str, Any]] = {}
         while True:
-            sample = self._inbox.get()
+            sample = self._next()
             key, m = str(sample.key_expr), msgpack.unpackb(sample.payload.to_bytes())
             if key.endswith("/truth"):
                 truths[key.split("/")[2]] = m
@@ -66,7 +75,17 @@ class RangeSensor:
                     truths = {}
             elif m["state"] == "stopped":
                 self._put(f"zsim/process/{ME}/bye", t_ns=m["t_ns"], **self._run, reason="the run ended")
-                return self._seq.get(self._key(), -1) + 1
+                return self._count()
+
+    def _next(self) -> zenoh.Sample:
+        try:
+            return self._inbox.get(timeout=SILENCE_S)
+        except Empty:
+            text = f"the world on {ENDPOINT} has been silent for {SILENCE_S:g} s; {self._count()} ranges came before"
+            raise SystemExit(f"{ME}: {text}") from None
+
+    def _count(self) -> int:
+        return self._seq.get(self._key(), -1) + 1
 
     def _answer(self, t_ns: int, truths: dict[str, dict[str, Any]]) -> None:
         if t_ns % PERIOD_NS == 0:
@@ -79,12 +98,14 @@ class RangeSensor:
 
 
 def world_info(session: zenoh.Session) -> dict[str, Any]:
-    """Return `world/info`, retrying while the world listens but does not answer yet."""
-    while True:
+    """Return `world/info`; retry while the world listens but does not answer yet; raise SystemExit after START_S."""
+    until_s = time.monotonic() + START_S
+    while time.monotonic() < until_s:
         for reply in session.get("zsim/world/info", timeout=1.0):
             if reply.ok is not None:
                 return msgpack.unpackb(reply.ok.payload.to_bytes())
         time.sleep(0.1)
+    raise SystemExit(f"{ME}: no world answers on {ENDPOINT} within {START_S:g} s")
 
 
 def main() -> None:
@@ -93,7 +114,7 @@ def main() -> None:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["{ENDPOINT}"]')
-    config.insert_json5("connect/timeout_ms", "60000")  # the world may still be starting
+    config.insert_json5("connect/timeout_ms", f"{1000 * START_S:.0f}")
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as session:
         print(f"measured {RangeSensor(session).run()} ranges")

@@ -21,7 +21,7 @@ class ZsimError(Exception):
         from IPython import get_ipython  # pyright: ignore[reportPrivateImportUsage]
 
         frames = list(takewhile(lambda each: _package(each) not in PACKAGES, _entries(self.__traceback__)))
-        while frames and _package(frames[-1]) in sys.stdlib_module_names:  # through which zsim calls itself
+        while frames and _package(frames[-1]) in sys.stdlib_module_names:  # frames through which zsim calls itself
             frames.pop()
         traceback: TracebackType | None = None
         for each in reversed(frames):
@@ -150,7 +150,7 @@ CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u20
 
 
 def printable(text: str) -> str:
-    """Return a text for a terminal, with control codes escaped, which network data may contain."""
+    """Return a text for a terminal with its control codes escaped, since text from the network may contain some."""
     return CONTROL.sub(lambda match: ascii(match[0])[1:-1], text)
 
 

@@ -144,7 +144,7 @@ def _fly(record: recorded_run.RecordedRun, agents: recorded_run.RecordedAgents) 
     if agents.failure and not bus.failure:
         bus.answer_all()
     if not compared.instants:
-        raise RecordError(f"{reader.path}: {until or 'holds no truth'}; a run is flown again from its start")
+        raise RecordError(f"{reader.path}: {until or 'contains no truth'}; a run is flown again from its start")
     first, hashes = bus.outputs.first, bus.hashes.hexdigests()
     return RerunResult(compared, world.result()["truth_sha256"], until, bus.refused, first, hashes, bus.failure)
 

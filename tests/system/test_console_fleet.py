@@ -67,6 +67,14 @@ def until_nothing(page: BrowserPage, faults: str) -> None:
         page.page.wait_for_timeout(POLL_MS)
 
 
+def wait_for(page: BrowserPage, count: int, of: Callable[[], list[Any]]) -> None:
+    """Wait until `of` returns at least `count` items."""
+    until_s = time.monotonic() + PATIENCE_S
+    while len(of()) < count:
+        assert time.monotonic() < until_s, of()
+        page.page.wait_for_timeout(POLL_MS)
+
+
 @pytest.fixture(scope="module")
 def fleet() -> Iterator[tuple[StagedRun, str]]:
     run = StagedRun(past_s=10.0, scenario=GRID)
@@ -118,8 +126,7 @@ def test_thirty_drones_are_sorted_filtered_and_commanded_together(
     land.click()
     page.page.wait_for_function(f"() => ({ROWS_JS})().length === 11")
     acquired = lambda: [args["drone"] for op, args in list(run.link.asked) if op == "acquire"]  # noqa: E731
-    while len(acquired()) < 2:
-        page.page.wait_for_timeout(50)
+    wait_for(page, 2, acquired)
     assert sorted(acquired()) == ["drone21", "drone29"]
 
     # a target is previewed before it is flown
@@ -135,8 +142,7 @@ def test_thirty_drones_are_sorted_filtered_and_commanded_together(
     targets = lambda: [args for op, args in list(run.link.asked) if op == "target"]  # noqa: E731
     assert targets() == []
     fly.click()
-    while not targets():
-        page.page.wait_for_timeout(50)
+    wait_for(page, 1, targets)
     assert targets() == [{"values": {"x_c": 9.0}}]
     page.page.wait_for_function("() => Number(document.getElementById('zsim-map').dataset.previews) === 0")
     page.page.get_by_label("Preview first").uncheck()
@@ -144,8 +150,7 @@ def test_thirty_drones_are_sorted_filtered_and_commanded_together(
     # the formation returns, first to above the centre of its starting positions
     run.link.asked.clear()
     page.press("Return")
-    while not targets():
-        page.page.wait_for_timeout(50)
+    wait_for(page, 1, targets)
     assert targets()[0] == {"values": {"x_c": 0.0, "y_c": 0.0}}
     assert page.faults == []
 

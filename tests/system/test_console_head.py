@@ -73,8 +73,9 @@ class Head:
     def show(self, **state: Any) -> None:
         """Change the state, and wait until the page shows it."""
         self.state = {**self.state, **state}
-        until = self.looks + LOOKS
+        until, until_s = self.looks + LOOKS, time.monotonic() + PATIENCE_S
         while self.looks < until:
+            assert time.monotonic() < until_s, (self.looks, until)
             self.page.wait_for_timeout(POLL_MS)
 
     def wait_for_copies(self) -> None:

@@ -390,7 +390,7 @@ def state_refusal(name: str, state: str, requested: str) -> str | None:
 
 
 POSE_AGE_MAX_NS = 500_000_000  # contract: 25 gates, 1 m at 2 m/s; also the limit for an estimate in flight
-DISTANCE_MAX_M = 100_000.0  # of each coordinate, as in scenarios: a tangent plane cannot represent a larger area
+DISTANCE_MAX_M = 100_000.0  # limit of each coordinate, as in scenarios: a tangent plane cannot represent a larger area
 SPEED_MAX_M_S = 200.0  # design choice: twice the speed of the fastest racing drones
 RATE_MAX_RAD_S = 100.0  # design choice: more than twice the range of a 2000 deg/s gyroscope
 UNIT_SLACK = 0.01  # tolerance of a quaternion's length; single precision stays within 1e-6

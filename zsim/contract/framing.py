@@ -9,7 +9,7 @@ contract and begin with `@`, which no wildcard of Zenoh matches: a subscriber to
     rows of numbers ── write ──▶ bytes ── read ──▶ rows of numbers
 
 A layout is the constant part of a kind of message: names, array heads, and the positions of the values. `write` and
-`read` are plain functions for their callers to compile, which avoids an object per message; `write` gives the same
+`read`, plain functions for their callers to compile, need no object per message; `write` gives the same
 bytes as `messages.encode`.
 """
 

@@ -459,7 +459,7 @@ class ProcessEntry(Struct, frozen=True):
     host: str
     pid: int
     from_ns: Count  # first gate that waits for it
-    done_ns: Whole = -1  # newest gate that it, or its former incarnation, has done; -1: none
+    done_ns: Whole = -1  # newest gate that it, or its former incarnation, has completed; -1: none
     former_pid: int | None = None  # pid of the incarnation that it replaces
 
 

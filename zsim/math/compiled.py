@@ -151,7 +151,7 @@ def _kept(function: Function, options: dict[str, Any]) -> Function:
         dispatcher: Any = _compile(function, {**options, "cache": True})
     except RuntimeError:  # neither the source's folder nor the user's cache is writable
         return _compile(function, options)
-    if dispatcher is not function:  # equal if NUMBA_DISABLE_JIT is set
+    if dispatcher is not function:  # the same if NUMBA_DISABLE_JIT is set
         dispatcher.compile = partial(_compile_once, dispatcher, dispatcher.compile)
     return dispatcher
 

@@ -63,7 +63,7 @@ def anchor(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[
 def geodetic(position_m: Array, rows: Array, place_m: Array) -> Array:
     """Return WGS 84 latitude [deg], longitude [deg] and ellipsoidal height [m] of points in W.
 
-    By Bowring's iteration on the parametric latitude, accurate to 1e-9 m for heights between -10 km and 1000 km
+    Use Bowring's iteration on the parametric latitude, accurate to 1e-9 m for heights between -10 km and 1000 km
     (Bowring, Survey Review 23 (1976) 323-327).
 
     Args:

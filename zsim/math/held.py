@@ -26,7 +26,7 @@ if COMPILES:
             return tuple((name, types.unliteral(kind)) for name, kind in fields)
 
     class _CompiledHeld(structref.StructRefProxy):
-        """The Held of compiled code; its type, read twice a call, is the slot itself, faster than numba's property."""
+        """The Held of compiled code; its type, read twice per call, is a slot, faster than numba's property."""
 
         __slots__ = ()
         _numba_type_: Any = structref.StructRefProxy.__dict__["_type"]

@@ -37,7 +37,7 @@ from zsim_agents.estimation.kalman_update import (
 from zsim_agents.estimation.measurement_update import correct_all
 from zsim_agents.estimation.strapdown import ATTITUDE, POSITION, VELOCITY, move_columns, recall_known
 
-SIGHTINGS_MAX = 1000  # maximum number used per gate; more are a flood
+SIGHTINGS_MAX = 1000  # maximum number used per gate; more indicate a flood
 PICTURES_KEPT = 256  # number of used pictures remembered: 1.4 s of those of 12 drones at 15 Hz
 SIGHTING = columns(  # sighting of one hat
     "SightingColumns",

@@ -49,7 +49,7 @@ REQUESTS_MAX = 1000  # maximum number of requests between two gates, as for a co
 WITHOUT_ARGUMENTS = ("takeoff", "land", "hold")
 OPERATIONS = (*WITHOUT_ARGUMENTS, "goto", "follow")
 EXPRESSION_FIELDS = ("constants", "duration_s")
-# a reference's other fields are for scenarios
+# the other fields of a reference are allowed in scenarios only
 FOLLOW_FIELDS = (*PATHS, *EXPRESSION_FIELDS, "origin_m", "time_scale", "fit")
 
 

@@ -53,8 +53,11 @@ class PlanItem(NamedTuple):
 
     @property
     def has_position(self) -> bool:
-        """Whether the item has a horizontal position, for which a non-zero x or y is enough."""
-        return any(math.isfinite(value) and value for value in (self.x, self.y))
+        """Whether the item has a horizontal position, for which one of x and y is enough.
+
+        A latitude and longitude of zero are none, as in ArduPilot; in a local frame they are the origin.
+        """
+        return any(math.isfinite(value) and (value or self.frame in LOCAL) for value in (self.x, self.y))
 
 
 class MissionReport(NamedTuple):

@@ -177,7 +177,7 @@ class SlaveApi:
 
     def getBusInfo(self, caller: str) -> Answer:
         """Return all connections, each as number, peer, direction, transport, topic, and whether it is up."""
-        links = [(link.caller, "o", topic) for topic, p in self._node.published.items() for link in list(p.links)]
+        links = [(link.caller, "o", topic) for topic, link in self._links()]
         links += [(uri, "i", topic) for topic, s in self._node.subscribed.items() for uri in list(s.connected)]
         return [
             OK,
@@ -186,15 +186,18 @@ class SlaveApi:
         ]
 
     def getBusStats(self, caller: str) -> Answer:
-        """Return the bytes sent per topic, and each connection's number, bytes, the topic's message count, and state.
+        """Return the bytes sent per topic, and each connection's number in getBusInfo, bytes, messages, and state.
 
         Subscribed topics and services are not included.
         """
-        sent: list[Any] = []
-        for topic, published in self._node.published.items():
-            links = [[n, link.sent, published.sent, True] for n, link in enumerate(list(published.links))]
-            sent.append([topic, sum(link[1] for link in links), links])
-        return [OK, "", [sent, [], []]]
+        by_topic: dict[str, list[Any]] = {topic: [] for topic in self._node.published}
+        for number, (topic, link) in enumerate(self._links()):
+            by_topic[topic].append([number, link.sent, link.message_count, True])
+        return [OK, "", [[[topic, sum(each[1] for each in links), links] for topic, links in by_topic.items()], [], []]]
+
+    def _links(self) -> "list[tuple[str, SubscriberLink]]":
+        """Return the connections of published topics, each with its topic."""
+        return [(topic, link) for topic, published in self._node.published.items() for link in list(published.links)]
 
     def requestTopic(self, caller: str, topic: str, protocols: list[list[Any]]) -> Answer:
         if topic not in self._node.published:
@@ -214,7 +217,7 @@ class SlaveApi:
 
     def shutdown(self, caller: str, reason: str = "") -> Answer:
         """Stop, as requested by `rosnode kill` or by a master that gives the name to another node."""
-        self._node.request_shutdown(f"{str(caller)[:80]} asks us to stop: {str(reason)[:200]}".rstrip(": "))
+        self._node.request_shutdown(f"{str(caller)[:80]} requests a shutdown: {str(reason)[:200]}".rstrip(": "))
         return [OK, "", 0]
 
 
@@ -252,7 +255,7 @@ class PublishedTopic:
 
 
 class SubscriberLink:
-    """The connection to one subscriber; a full queue drops its oldest message. Counts bytes sent and messages lost."""
+    """The connection to one subscriber; a full queue drops its oldest message. Counts bytes, messages and lost ones."""
 
     def __init__(self, writer: StreamWriter, caller: str, queue_size: int) -> None:
         self._writer = writer
@@ -260,6 +263,7 @@ class SubscriberLink:
         self._message_queued = asyncio.Event()
         self.caller = caller
         self.sent = 0
+        self.message_count = 0
         self.lost = 0
 
     def put(self, framed: bytes) -> None:
@@ -278,6 +282,7 @@ class SubscriberLink:
                     self._writer.write(framed)
                     await self._writer.drain()
                     self.sent += len(framed)
+                    self.message_count += 1
 
 
 class EmptyService:

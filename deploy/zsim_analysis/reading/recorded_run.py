@@ -94,7 +94,7 @@ def answered_until_ns(reader: RecordReader, info: messages.Info) -> int:
     """
     clock = reader.last(keys.CLOCK)
     if clock is None:
-        raise RecordError(f"{reader.path}: holds no gate")
+        raise RecordError(f"{reader.path}: contains no gate")
     return clock.t_ns - info.gate_ns - info.command_delay_ns
 
 

@@ -311,7 +311,9 @@ def sweep(
     try:
         rows = fly_plan(plan, folder, workers, dask, force)
     except KeyboardInterrupt:
-        note(f"interrupted; the same command with --out {folder} continues the sweep; its table so far is there")
+        note(
+            f"interrupted; the same command with --out {folder} continues the sweep; the table so far is in that folder"
+        )
         sys.exit(INTERRUPTED)
     failures = [row["failure"] for row in rows if row["failure"]]
     shortfall_texts = [row["shortfall"] for row in rows if row.get("shortfall") and not row["failure"]]
@@ -611,8 +613,9 @@ def board(
     from zsim.runtime.progress import PipedConsole
 
     if papers:
-        if laws or scenarios or formats:
-            raise BadParameter("--papers flies no scenario; leave out --laws, --scenarios and --format")
+        given = {"--laws": laws, "--scenarios": scenarios, "--format": formats}
+        if useless := " and ".join(name for name, value in given.items() if value):
+            raise BadParameter(f"--papers flies no scenario; leave out {useless}")
         from zsim_analysis.board.papers import terminal_table, write_papers
 
         papers_folder = out or Path("runs") / "papers"

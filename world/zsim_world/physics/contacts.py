@@ -131,13 +131,13 @@ def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
     share = distance / (first[VEHICLE.hull_radius] + second[VEHICLE.hull_radius])
     arms = scaled(n, share * first[VEHICLE.hull_radius]), scaled(n, -share * second[VEHICLE.hull_radius])
     v = subtract(velocity_at(bodies.state[j], arms[1]), velocity_at(bodies.state[i], arms[0]))
-    # The softer hull counts, so that the time step is short enough for a light drone.
+    # The smaller values are used, so that the time step stays short enough for a light drone.
     stiffness = min(first[VEHICLE.hull_stiffness], second[VEHICLE.hull_stiffness])
     damping = min(first[VEHICLE.hull_damping], second[VEHICLE.hull_damping])
     depth = first[VEHICLE.hull_radius] + second[VEHICLE.hull_radius] - distance
     normal = hull_force(stiffness, damping, depth, -dot(v, n))
     slip = axpy(v, -dot(v, n), n)
-    # Slip decays at the rate of the approach, although a tangential force, which turns the hull, meets less inertia.
+    # Slip decays like the approach, although a tangential force meets less inertia because it also turns the hulls.
     linear_mobility = 1.0 / first[VEHICLE.mass] + 1.0 / second[VEHICLE.mass]
     angular_mobility = dot(arms[0], arms[0]) / _min_inertia(first) + dot(arms[1], arms[1]) / _min_inertia(second)
     viscous, limit = (
@@ -199,7 +199,7 @@ def _strayed(state: NDArray, origin: NDArray) -> bool:
 
 @inlined
 def _may_see(radius: float, eye: NDArray, aside: float, dz: float, distance: float) -> bool:
-    """Return whether a hull dz above a drone may enter its downward view, a cone of limited range, until one strays.
+    """Return whether a hull dz above a drone may enter its downward view, a cone of limited range, before one strays.
 
     Args:
         dz: negative if the hull is below the drone [m].
@@ -211,7 +211,10 @@ def _may_see(radius: float, eye: NDArray, aside: float, dz: float, distance: flo
 
 @inlined
 def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPairs) -> None:
-    """Note all pairs that can touch, be in downwash or be the closest until a drone strays, and who is above others."""
+    """Find the pairs that may touch, be in downwash or be the closest, and the drones that may see one below them.
+
+    The result is valid until a drone strays.
+    """
     count, min_distance = 0, math.inf
     for i in range(state.shape[0]):
         near.above[i] = 0
@@ -241,11 +244,11 @@ def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPa
 
 @inlined
 def meet_drones(bodies: Bodies) -> float:
-    """Add downwash to `air` and hull forces to `push`; return the smallest distance between two drones [m].
+    """Add downwash to `air`, hull forces to `push`, moments to `twist`; return the smallest distance of two drones [m].
 
-    Only near pairs are examined, in the order of all pairs, which gives the same bits as examining all. They are
-    updated when a drone has moved by STRAY_M. `touching[i, j]` is 1 where i < j are in contact now; `touched` is set to
-    1 where contact begins.
+    Only near pairs are examined, in the order of all pairs, which gives the same bits as examining all. The near pairs
+    are updated when a drone has moved by STRAY_M. `touching[i, j]` is 1 where i < j are in contact now; `touched` is
+    set to 1 where contact begins.
     """
     near = bodies.near
     if _strayed(bodies.state, near.origin):

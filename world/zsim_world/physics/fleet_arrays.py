@@ -23,7 +23,7 @@ from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
 from zsim.vehicles.vehicle import Aerodynamics, Vehicle, allocation, lift_shares, mixing
 from zsim_world.physics.rays import Scene
 
-REFERENCE_DENSITY_KG_M3 = SEA_LEVEL_KG_M3  # air density at which a vehicle's thrust, torque and drag are given
+REFERENCE_DENSITY_KG_M3 = SEA_LEVEL_KG_M3  # air density for which a vehicle's coefficients are given
 
 VEHICLE = columns(
     "VehicleColumns",

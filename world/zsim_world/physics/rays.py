@@ -1,9 +1,9 @@
 """Intersection of rays with ground, obstacles, triangles and drone hulls: exact, compiled, the same bits everywhere.
 
 Every solid is convex, an intersection of slabs, a quadric or both, so a ray is inside from the last entry to the first
-exit (Kay and Kajiya, SIGGRAPH 1986). Triangles: Moeller and Trumbore, J. Graphics Tools 2 (1997), both
-sides. Obstacles and triangles are the leaves of one bounding volume hierarchy, traversed from near to far. Drones move
-and are few: a caster tests each ray against those within reach.
+exit (Kay and Kajiya, SIGGRAPH 1986). Triangles are hit from both sides (Moeller and Trumbore, J. Graphics Tools 2
+(1997)). Obstacles and triangles are the leaves of one bounding volume hierarchy, traversed from near to far. Drones
+move and are few: the caller tests each ray against those within reach.
 """
 
 import math

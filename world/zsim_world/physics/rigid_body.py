@@ -1,7 +1,7 @@
 """One drone as a rigid body under rotor, drag, ground and contact forces, stepped by fourth-order Runge-Kutta.
 
-Then come the rotors (lag, thrust, torque, power), the mixer, which finds speeds for a thrust and a moment, and the
-battery. Rotor r is at (x, y) in B, in units of rotor_unit; seen from above, it turns clockwise if its `turn` is 1.
+It includes the rotors (lag, thrust, torque, power), the mixer, which finds rotor speeds for a thrust and a moment, and
+the battery. Rotor r is at (x, y) in B, in units of rotor_unit; seen from above, it turns clockwise if its `turn` is 1.
 `PerRotor` holds groups of numbers per rotor, in the order of fleet_arrays.ROTOR.
 """
 
@@ -69,7 +69,7 @@ def accelerations(
 ) -> tuple[Vector, Vector]:
     """Return a_WB in W [m/s^2] and the angular acceleration in B [rad/s^2].
 
-    m a = R z_B T - D (v - air) + ground + push - m g z_W
+    m a = T z_B - D (v - air) + ground + push - m g z_W
     I dw/dt = M - w × (I w)
 
     Args:
@@ -178,7 +178,7 @@ def step(
 
 @inlined
 def lag(speeds: PerRotor, commands: PerRotor, decay: float) -> None:
-    """Advance rotor speeds [rad/s] in place until the fraction `decay` of their error is left."""
+    """Advance rotor speeds [rad/s] in place until only the fraction `decay` of their error is left."""
     for r in range(len(speeds.each)):
         put_value(speeds, r, lagged(value_of(speeds, 0, r), value_of(commands, 0, r), decay))
 
@@ -393,7 +393,7 @@ def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: Per
 def power(row: NDArray, speeds: PerRotor) -> float:
     """Return the electric power [W] at given rotor speeds [rad/s].
 
-    It is the power of the shafts, the sum of k_M w^3, divided by the efficiency, plus that of the electronics.
+    It is the shaft power, the sum of k_M w^3, divided by the efficiency, plus the power of the electronics.
     """
     cubes = 0.0
     for r in range(len(speeds.each)):

@@ -24,7 +24,7 @@ from zsim_world.physics.surfaces import Touch, drag_anchors
 LANES = 8  # number of doubles in one 512-bit register, or in two 256-bit registers
 LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of a lane without a drone
 
-# Every block begins with the parameters of its drones. This one ends with groups of numbers per rotor.
+# Every block begins with the parameters of its drones. A block of bodies ends with groups of numbers per rotor.
 BODY_LANES = columns(
     "BodyLanes",
     (
@@ -158,7 +158,7 @@ def accelerate(bodies: Bodies) -> None:
 
 @inlined
 def line_up(bodies: Bodies) -> None:
-    """Copy the state of all drones into the blocks, which hold it from then on."""
+    """Copy the state of all drones into the blocks, which keep it up to date from then on."""
     for i in range(bodies.state.shape[0]):
         _put_state(bodies.lanes[i // LANES], i % LANES, bodies.state[i], bodies.each)
 
@@ -185,7 +185,7 @@ def _put_state(lanes: NDArray, k: int, state: NDArray, each: tuple[int, ...]) ->
 
 @inlined
 def _load(bodies: Bodies, lanes: NDArray, first: int) -> bool:
-    """Copy commands, air and forces into a block; return whether any of its drones is out of the ground's reach.
+    """Copy commands, air and forces into a block; return whether any of its drones is out of reach of the ground.
 
     `first`: index of the block's first drone. The results of lanes without a drone are never read.
     """

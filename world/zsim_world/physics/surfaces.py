@@ -7,13 +7,13 @@ At obstacles a drone is a rigid set of balls: the ground contact points, with ra
 one at its centre, so that neither a post nor an edge fits between them. A ball is pushed along the surface normal by
 the same law. The distance to a convex solid acts as a potential, so springs and anchors never return more energy than
 was put in. A drone has slots for the solids within its reach, each with an anchor per ball; they are updated after
-every step and held within it.
+every step and fixed during it.
 
 At surfaces (sheets of triangles) each ball instead has a plane at the nearest point, found after every step and
-then held. A sheet has no inside. A ball starts in front of it, and its side is stored: it changes sides when its path
-from step to step crosses a triangle, and behind the sheet it is pushed back, however deep it is. Beside a rim a ball is
-always free. A closed mesh therefore acts from outside as a solid; like a box, it can be penetrated where a wall is
-thinner than the dent of a collision.
+then fixed. A sheet has no inside. A ball starts in front of it, and its side is stored: it changes sides when its path
+from step to step crosses a triangle. Behind the sheet it is pushed back while the drone's centre is within
+PENETRATION_MAX_M. A ball nearest to an outer edge is always in front. A closed mesh therefore acts from outside as a
+solid; like a box, it can be penetrated where a wall is thinner than the dent of a collision.
 """
 
 import math
@@ -327,7 +327,7 @@ def drag(row: Row, depth: float, x: Vector, n: Vector, anchor: NDArray, is_new: 
         anchor[axis] = x[axis] - keep * gap[axis]
 
 
-PENETRATION_MAX_M = 1.0  # m; design choice: depth from which a sheet no longer pushes a drone back
+PENETRATION_MAX_M = 1.0  # m; design choice: distance of a drone's centre from which a sheet no longer pushes it back
 EDGE_DISTANCE_M = 1e-9  # m; within this distance of an edge or corner a ball keeps its normal
 DISTANCE_MARGIN_M = 1e-6  # m; margin above the rounding error of a distance
 
@@ -377,7 +377,7 @@ def _follow(row: Row, sheet: Sheet, plane: NDArray, k: int, p_WB: Vector, q_WB: 
     is_new = plane[PLANE.side] == 0.0
     side = 1.0 if is_new else plane[PLANE.side]
     previous = p_WB if is_new else vector(plane, PLANE.centre_W)
-    # if farther away, it has not crossed
+    # a ball farther from the surface than this has not crossed it
     max_distance = row[VEHICLE.foot_depth] if is_new else norm(subtract(x, previous))
     if closest.distance <= max_distance and crosses(sheet, previous, x):
         side = -side

@@ -1,6 +1,6 @@
-"""The world of a flight: integrates all drones, owns simulated time, applies commands and faults.
+"""The world of a flight: integrates the simulated drones, owns simulated time, applies commands and faults.
 
-It has neither a session nor a wall clock. `zsim_world.run.coordinator` has the part common to flights and replays.
+It has neither a session nor a wall clock. `zsim_world.run.coordinator` contains the part common to flights and replays.
 """
 
 from collections.abc import Callable, Iterable, Sequence

@@ -54,7 +54,7 @@ SCANNER = columns(
         Field("quantum", "m"),
         Field("miss", "1"),  # a value is missed when its standard normal variate is below this
         Field("drop", "1"),  # likewise, a message is lost
-        Field("stuck", "1"),  # 1: stuck by a fault, repeats the first message since then
+        Field("stuck", "1"),  # 1: a fault makes it repeat its first message since the fault began
     ),
 )
 

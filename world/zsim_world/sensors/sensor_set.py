@@ -82,7 +82,7 @@ SCHEDULE = columns(  # sample n is due at the first physics tick >= n * numerato
 )
 FIELD_MIN_UT = 1.0  # uT, weakest horizontal field from which a heading is derived: a fifteenth of that at 50 deg N
 HEADING_SIGMA_MAX_RAD = 0.5  # rad, design choice: noisier headings wrap around, so their mean is meaningless
-DENOMINATOR_MAX = 1000  # largest denominator of a rate [Hz]: matches any within 0.05 %; n * numerator stays below 2^63
+DENOMINATOR_MAX = 1000  # largest denominator of a rate [Hz]: fits any to 0.05 %; n * numerator stays below 2^63
 SEA_LEVEL_PA = 101_325.0  # Pa, ISO 2533
 LAPSE_1_M = 2.25577e-5  # 1/m, 0.0065 K/m over 288.15 K, ISO 2533
 PRESSURE_EXPONENT = 5.25588  # g M / (R L), ISO 2533

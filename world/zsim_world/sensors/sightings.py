@@ -325,7 +325,7 @@ def _drone_hides(eye: Vector, ray: Vector, away: float, i: int, m: int, pose: ND
 
 @inlined
 def _passes(eye: Vector, ray: Vector, away: float, p: Vector, radius: float) -> bool:
-    """Return whether a sphere is clear of the sight line to a point at distance `away` [m] along `ray`."""
+    """Return whether a sphere is clear of the line of sight to a point at distance `away` [m] along `ray`."""
     to = subtract(p, eye)
     along = min(max(dot(to, ray), 0.0), away)
     offset = axpy(to, -along, ray)

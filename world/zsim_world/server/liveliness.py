@@ -205,13 +205,13 @@ class SlowReaders:
             clause = f", which reads {', '.join(reads[:SHOWN])}{ellipsis}," if reads else ""
             reader = f"{closed.process or 'somebody'} at {closed.address} on {host}"
             size = f"{closed.held_bytes / 1e6:.1f} MB"
-            text = f"{reader} ({names}){clause} took nothing of {size}; its link is closed ({closed.times} so far)"
+            text = f"{reader} ({names}){clause} read none of {size}; its link is closed ({closed.times} times so far)"
             self._run.call("reader_closed", text, {**closed._asdict(), "host": host, "reads": reads})
 
     def stuck(self) -> str:
         """Return a text that names the blocked link."""
         names = self.watch.stuck()
-        return f"the link to {names[0]} takes no data" if names else "no link is known to be full"
+        return f"the link to {names[0]} accepts no data" if names else "no link is known to be full"
 
 
 @dataclass
@@ -244,7 +244,7 @@ class Admission:
         self._trusts = trusts
         self._sessions: dict[str, Sessions] = {}  # by process, the sessions whose tokens have proved it
         self._withheld: dict[str, _Withheld] = {}
-        self._blocked_ns: dict[str, int] = {}  # how long processes lacking token or done have blocked the clock
+        self._blocked_ns: dict[str, int] = {}  # how long processes without a token or a done have blocked the clock
         self._look_wall_ns = 0
 
     def take(self, name: str, join: Join, wall_ns: int) -> None:

@@ -371,14 +371,14 @@ class WorldProcess:
 
 
 class DirectInputs:
-    """Reads on the loop's own thread and waits on the last subscription: the fastest for an unpaced run."""
+    """Reads on the loop's own thread and waits on the last subscription, which is fastest for an unpaced run."""
 
     def __init__(self, subscriptions: Sequence[Subscription]) -> None:
         self._subscriptions = subscriptions
         self._received: list[ReceivedSample] = []
 
     def wait(self, timeout_s: float | None) -> None:
-        """Wait for a message, for a limited time only; a timeout shorter than TICK_S is slept through."""
+        """Wait for a message or the next `wake`, or sleep through a timeout shorter than TICK_S."""
         if timeout_s is not None and timeout_s < TICK_S:
             time.sleep(timeout_s)
             return

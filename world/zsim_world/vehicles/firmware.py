@@ -178,7 +178,7 @@ def settings(vehicle: Vehicle, drone: Drone) -> NDArray[np.float64]:
 
 
 def loop_gains(design: Firmware, rotor_lag_s: float) -> tuple[float, float, float]:
-    """Return the gains of the rate, tilt and velocity loops [1/s] for a lag of the rotors."""
+    """Return the gains of the rate, tilt and velocity loops [1/s] for a given rotor lag."""
     rate = design.rate_per_lag / max(design.lag_lead * rotor_lag_s, design.lag_min_s)
     return rate, rate / design.loop_ratio, rate / el.square(design.loop_ratio)
 
@@ -342,7 +342,7 @@ def _weaken(command: NDArray, actuator: NDArray) -> None:
 class Decision(NamedTuple):
     """The firmware's decision for the next 5 ms."""
 
-    driven: bool  # True: the drive computes the command from the fields below; False: it is already set
+    driven: bool  # True: `drive` computes the command from the fields below; False: it is already set
     z_H: Vector  # along the desired z_B, in the heading frame; not normalised
     thrust_n: float
     yaw_rate: float  # rad/s
@@ -545,7 +545,7 @@ def _commanded_velocity(kind: int, own: Quaternion, setting: NDArray, setpoint: 
 
 @inlined
 def _hold_velocity(memory: NDArray, belief: NDArray, own: Quaternion, setting: NDArray, v_des: Vector) -> Vector:
-    """Return `v_des` with its horizontal part replaced by the velocity that holds the odometry's position."""
+    """Return `v_des` with its horizontal part replaced by the velocity towards the held position, by odometry."""
     v_W = rot.rotate(own, vector(belief, BELIEF.v_H))
     for k in range(2):
         if memory[MEMORY.holds_xy] == 0.0:

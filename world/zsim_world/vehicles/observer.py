@@ -252,7 +252,7 @@ def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
 
 @inlined
 def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
-    """Correct height, climb, vertical disturbance and accelerometer bias by an innovation, with gains from `at` on."""
+    """Correct height, climb rate, vertical disturbance and bias by an innovation, with gains from column `at` on."""
     belief[BELIEF.height] += gain[at] * e
     belief[BELIEF.v_H + 2] += gain[at + 1] * e
     belief[BELIEF.disturbance + 2] += gain[at + 2] * e
@@ -345,7 +345,7 @@ GAIN = columns(  # innovation -> state, in the unit of the state over that of th
         Field("flow_tilt", ""),
         Field("flow_rate", ""),
         Field("flow_u", ""),
-        Field("lift_z", "", 4),  # accelerometer, vertical: height, climb, disturbance, bias
+        Field("lift_z", "", 4),  # accelerometer, vertical: height, climb rate, disturbance, bias
         Field("climb_z", "", 4),  # flow, vertical, as above
         Field("baro_z", "", 4),
         Field("sonar_z", "", 4),

@@ -372,6 +372,22 @@ def test_int32_max_in_an_integer_item_is_nan_in_a_float_item(autopilot: str) -> 
 
 @AUTOPILOTS
 @pytest.mark.parametrize(
+    ("frame", "place"), [(MavFrame.LOCAL_NED, (0.0, 0.0)), (MavFrame.GLOBAL_RELATIVE_ALT_INT, (7.0, -4.0))]
+)
+def test_a_landing_at_zero_is_at_a_local_frame_s_origin_but_nowhere_on_earth(
+    autopilot: str, frame: int, place: tuple[float, float]
+) -> None:
+    drone = flying(autopilot)
+    drone.position[:2] = [7.0, -4.0]
+    land = dialect.MissionItemInt(1, 1, 1, frame, Cmd.NAV_LAND)
+    assert upload(drone, [item(0, Cmd.NAV_TAKEOFF, 0, 3), land]) == 0
+    assert drone.command(Cmd.MISSION_START, 1) == Result.ACCEPTED
+    drone.until(lambda: drone.state == "landed", 20_000)
+    assert drone.position[:2] == pytest.approx(place, abs=1.2)
+
+
+@AUTOPILOTS
+@pytest.mark.parametrize(
     ("frame", "x", "y", "place"),
     [
         (MavFrame.GLOBAL_RELATIVE_ALT_INT, NO_INT, NO_INT, (7.0, -4.0)),

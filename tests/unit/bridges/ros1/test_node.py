@@ -528,6 +528,27 @@ async def test_a_service_reports_its_type_and_serves_persistent_connections(grap
 
 
 @in_loop
+async def test_messages_and_bytes_are_counted_for_each_connection(graph) -> None:
+    a, topic = graph.publishing()
+    other = a.publish("/u", TWIST, 10)
+    async with a.running():
+        writers: list[asyncio.StreamWriter] = []
+        uri, port = await graph.uri("/t"), await graph.port("/t")
+        for published, sent_bytes in ((topic, 52), (topic, 156), (other, 52)):
+            reader, writer = await connect(port, subscriber(published.topic_type.name))
+            writers.append(writer)
+            await wire.read_header(reader)
+            published.publish(lambda _: twist(1.0))
+            await until(lambda of=published, total=sent_bytes: sum(link.sent for link in of.links) == total)
+        stats = (await call(uri, "getBusStats"))[2][0]
+        numbers = [each[0] for each in (await call(uri, "getBusInfo"))[2]]
+        for writer in writers:
+            writer.close()
+    assert stats == [["/t", 156, [[0, 104, 2, True], [1, 52, 1, True]]], ["/u", 52, [[2, 52, 1, True]]]]
+    assert numbers == [0, 1, 2]
+
+
+@in_loop
 async def test_the_slave_api_answers_the_requests_of_ros_tools(graph) -> None:
     a, topic = graph.publishing()
     a.subscribe("/in", EMPTY, lambda _: None)

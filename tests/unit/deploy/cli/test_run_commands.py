@@ -19,7 +19,7 @@ from zsim_deploy.launch.supervisor import Outcome
 
 INTERRUPTED = Outcome("interrupted by Ctrl-C", interrupted=True)
 DIED = Outcome("the world died", failed=True)
-NO_MESSAGE = RecordError("run.mcap: holds no message")
+NO_MESSAGE = RecordError("run.mcap: contains no message")
 
 
 @pytest.fixture(autouse=True)
@@ -169,6 +169,14 @@ def test_options_of_an_environment_are_refused_by_name_without_a_bundle(options:
         run_commands.rerun(
             tmp_path, install="--install" in options, python=Path("python3.11") if "--python" in options else None
         )
+    assert raised.value.message.endswith(f"leave out {' and '.join(options)}")
+
+
+@pytest.mark.parametrize("options", [("--laws",), ("--format",), ("--laws", "--scenarios", "--format")])
+def test_only_the_given_options_are_refused_for_the_figures_of_papers(options: tuple[str, ...]):
+    laws, scenarios = (f"of {option}" if option in options else None for option in ("--laws", "--scenarios"))
+    with pytest.raises(typer.BadParameter) as raised:
+        run_commands.board(laws, scenarios, formats=["pdf"] if "--format" in options else None, papers=True)
     assert raised.value.message.endswith(f"leave out {' and '.join(options)}")
 
 
