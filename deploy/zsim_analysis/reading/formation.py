@@ -197,7 +197,7 @@ def _min_distance_m(tracks: list[Track]) -> float | None:
 
 
 class GoalErrors(NamedTuple):
-    """Errors (K, 4n) of a formation against its plan's target; NaN from the start of the plan's trajectory or landing on.
+    """Errors (K, 4n) of a formation against its plan's target; NaN once its trajectory or landing starts.
 
     The paper's Figure 5 shows these errors, which include the climb from the ground.
     """
