@@ -187,7 +187,7 @@ class InProcessFlight:
         self.bus.publish(caller, t_ns, [caller.command(t_ns, *command) for command in commands])
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
-        """Answer a request to the world, or to the controller of a cluster, between two gates."""
+        """Answer a request to the world, a controller or a pilot, between two gates."""
         if key == keys.CONTROL:
             return self.world.control(request)
         for agent in self.agents:

@@ -89,7 +89,7 @@ class Federation(Assertions):
             Simulated time starts only once every program with a name ("ground.main=python ground.py") has joined.
             A program that ends with a code other than 0 fails the flight, unless the test has killed it.
         options: further options of `zsim run`, such as "--hosted", or "--rate" and "1".
-        modules: further folders with the modules of named classes, beside those of the scenario.
+        modules: folders with the modules of named classes, in addition to those of the scenario.
 
     Attributes:
         endpoint, name: the endpoint of the world; the name of the federation.

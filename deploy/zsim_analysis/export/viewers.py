@@ -55,7 +55,7 @@ Plot = tuple[str, list[Curve]]  # title and curves
 
 
 def variable_plots(variables: Mapping[str, Sequence[str]]) -> dict[str, list[Plot]]:
-    """Return plots by cluster, one for each of its first variables; `variables` are its numeric fields."""
+    """Return plots by cluster, for its first PLOTS_MAX variables; `variables`: numeric fields by cluster."""
     plots: dict[str, list[Plot]] = {}
     for cluster, fields in variables.items():
         topic, component = f"/cluster/{cluster}/variables", f"{PACKAGE}.Cluster_{tidy(cluster)}:message"

@@ -59,7 +59,7 @@ class HuntRequest(Struct, frozen=True):
 
     document: dict[str, Any]  # the scenario's document, with the overrides of the command line
     source: str  # name of the scenario's file, for messages
-    requirements: tuple[str, ...]  # comparisons, or functions of the user's own, `module:function`
+    requirements: tuple[str, ...]  # comparisons, or the user's functions, `module:function`
     out: Path
     seed: int = 1  # seed of the draws
     flights: int | None = None
@@ -120,7 +120,7 @@ class Violation(Struct, frozen=True):
     margin: float | None  # margin of the recorded flight, or else of the one found; None if it is unknown
     unknown: str  # the unknown quantity, or why the flight failed
     causes: list[CauseFound]
-    options: list[str]  # options with which `zsim run` of the scenario flies the shrunk flight
+    options: list[str]  # options with which `zsim run SCENARIO` flies the shrunk case
     truth_sha256: str | None
 
 

@@ -32,12 +32,12 @@ from zsim_analysis.reading.recorded_run import scenario_of, search_modules
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 TRUTH_WIDTH = 13  # position, velocity, orientation, angular velocity
-CONNECTED_MIN = 0.5  # minimum reception probability of a connected link; this defines the range
+CONNECTED_MIN = 0.5  # minimum reception probability, apart from loss, of a connected link: that at range_m
 
 
 @dataclass
 class Track:
-    """True motion of one drone, W and B as in the contract."""
+    """True motion of one drone, in the frames W and B of the contract."""
 
     name: str
     t_ns: Times  # (T,) times of the truth, ascending and unique

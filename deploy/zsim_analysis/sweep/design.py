@@ -53,7 +53,7 @@ class SweepPlan(Struct, frozen=True, kw_only=True):
     runs: int  # number of runs; a plan with more runs begins with the same ones
     records: bool = False  # whether every run keeps its record
     changed: tuple[str, ...] | None = None  # overrides `a.b.c=value` of the command line; None: not known
-    version: str = __version__  # version of zsim; others may give other numbers
+    version: str = __version__  # version of zsim; other versions may give different results
 
 
 def difference(old: SweepPlan, new: SweepPlan) -> str | None:
