@@ -277,7 +277,7 @@ def fly_as_processes(scenario: Resolved, folder: Path) -> None:
     """Fly a resolved scenario as processes on this machine, into a new run folder.
 
     Raises:
-        RunError: nothing was recorded; the error has the last line that `zsim run` printed.
+        RunError: nothing was recorded; the error includes the last line that `zsim run` printed.
     """
     log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
     log.parent.mkdir(parents=True)

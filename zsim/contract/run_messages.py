@@ -252,7 +252,7 @@ class ClusterRequest(Message, frozen=True):
 def _infinite_fault(field: str, value: Any) -> str | None:
     """Return the fault of a field with arbitrary content if it contains a number that is not finite."""
     infinite = next((number for number in _numbers(value) if not math.isfinite(number)), None)
-    return None if infinite is None else f"{field} holds {infinite}; its numbers must be finite"
+    return None if infinite is None else f"{field} contains {infinite}; its numbers must be finite"
 
 
 def _numbers(value: Any) -> Iterator[float]:

@@ -46,7 +46,7 @@ PLAN, TABLE, SCENARIO, VIOLATION = "hunt.json", "flights.csv", "violation.yaml",
 BUNDLE = "violation.zsim"
 OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, BUNDLE, "summary.json", "report.html", "figures", ".lock")
 SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages besides those of `shrink`
-SAME_BITS = "same_bits"  # quantity: whether truth is bit-identical to that of the same flight in which no process dies
+SAME_BITS = "same_bits"  # quantity: whether the truth is bit-identical to that of the flight without process deaths
 MISSES_MAX = 100  # successive draws that cannot be flown, after which --vary is deemed wrong; design choice
 DECIMALS = 6  # decimals of margins in the table
 

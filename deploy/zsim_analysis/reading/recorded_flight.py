@@ -135,7 +135,7 @@ class RecordedProcess:
 
 
 class RadioSummary(Struct, frozen=True):
-    """The reception of drones, averaged over a window."""
+    """The reception between drones, averaged over a window."""
 
     heard_mean: float  # expected number of drones that a drone hears: 4 with a loss of one half count as 2
     connected_share: float  # share of time in which every drone can reach all others, directly or via relays
@@ -147,7 +147,7 @@ class RadioHistory:
     Attributes:
         t_ns: times, ascending, (K,).
         heard: expected number of other drones whose messages arrive, (K, N).
-        connected: whether the graph of links of at least CONNECTED_MIN, without `loss`, was strongly connected, (K,).
+        connected: whether links with a reception >= CONNECTED_MIN, `loss` aside, strongly connect the drones, (K,).
         share: probability that a message of drone j arrives at drone i, mean over time, (N, N).
 
     Args:
@@ -208,7 +208,7 @@ class RecordedFlight:
     # estimates and commands by drone; empty unless requested
     estimates: dict[str, DroneEstimates] = field(default_factory=dict)
     commands: dict[str, VelocityCommands] = field(default_factory=dict)
-    others: dict[str, int] = field(default_factory=dict)  # in process: number of messages by key that no report reads
+    others: dict[str, int] = field(default_factory=dict)  # in process: message counts of keys that no report reads
     cpu_s: float | None = None  # CPU time of this process from the first gate to the last; None for a record
     radio: RadioHistory | None = None  # None if the scenario has no radio
     references: dict[str, DroneReferences] = field(default_factory=dict)  # of drones that fly on their own, by drone

@@ -199,7 +199,7 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
 def _refusal_before(event: Event, flight: RecordedFlight) -> str:
     """Return why a drone's latest refused command was refused, if that may explain an event; otherwise empty.
 
-    Only the first of many equal refusals are events; the last of these says that further ones are only counted.
+    Only the first of many identical refusals are events; the last of these says that further ones are only counted.
     """
     commands = f"drone/{event.subject}/cmd/"
     for each in reversed(flight.events):

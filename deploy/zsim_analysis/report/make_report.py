@@ -1,7 +1,7 @@
 """Makes the report of a run: record in; summary.json, figures/*.png and report.html out.
 
-A page is self-contained, figures included; it loads nothing from the network. Comparisons and sweeps are written by
-the same functions.
+A page is self-contained, figures included; it loads nothing from the network. The same functions write the pages of
+comparisons and sweeps.
 """
 
 import base64

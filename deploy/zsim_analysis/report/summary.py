@@ -537,7 +537,7 @@ def _is_printed(drone: Drone) -> bool:
 
 
 def _is_led(cluster: Cluster) -> bool:
-    """Return whether the plan of a cluster of ROBOTS leads from the ground to equation (3)."""
+    """Return whether the plan of a cluster of ROBOTS leads from the ground to the target of equation (3)."""
     plan = cluster.plan
     if plan.takeoff_s is None or plan.trajectory is not None:
         return False

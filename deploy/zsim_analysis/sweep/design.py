@@ -437,7 +437,7 @@ def _refuse_overlap(path: str, steps: FieldPath, fields: dict[FieldPath, str]) -
 
 
 def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
-    """Return the faults of the number of runs; `all_known`: no axis, perhaps of drawn values, was refused."""
+    """Return the faults of the number of runs; `all_known`: no variation was refused."""
     runs, points = design.plan.runs, design.points
     if runs > RUNS_MAX:
         return [f"--runs is {runs}; must be at most {RUNS_MAX}"]

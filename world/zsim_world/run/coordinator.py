@@ -393,7 +393,7 @@ class Coordinator(ABC):
             self.outbox.refusals.count += 1
             return
         data = {"host": join.host, "pid": join.pid, "incarnation": join.incarnation}
-        effect = "takes nobody's place" if name in self.barrier.participants else "is not waited for"
+        effect = "replaces no process" if name in self.barrier.participants else "is not waited for"
         text = f"{name} on {join.host} (pid {join.pid}) {fault}; its join {effect}"
         self.outbox.event("no_show", name, text, data)
 
