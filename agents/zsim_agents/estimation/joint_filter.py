@@ -71,7 +71,7 @@ class ClusterBanks:
     """A JointBank per cluster and an EstimatorBank per drone in no cluster, with the methods of one EstimatorBank.
 
     Attributes:
-        drones: drones whose sensors are needed; `receive` takes indices into it.
+        drones: drones whose sensors are needed; `receive` takes indices into this list.
     """
 
     def __init__(self, scenario: Scenario, drones: Sequence[str], gate_s: float) -> None:

@@ -1,8 +1,8 @@
 """The phases of a formation flight: take-off, assembly, engaged flight on references, hold, landing.
 
 `Engagement` does not communicate: at each gate it takes estimates and returns commands; requests arrive between gates.
-Every engagement, resumption and reference is checked, every refusal gives a reason, and every reference starts at the
-present state of the formation.
+Every engagement, resumption and reference is checked, every refusal gives a reason, and every new reference starts at
+the estimate of the formation or continues the previous reference.
 """
 
 from __future__ import annotations

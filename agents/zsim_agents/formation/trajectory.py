@@ -52,7 +52,7 @@ class Variables(Protocol):
 
 
 class Reference(Protocol):
-    """A motion in cluster space; duration_s is the time after which it stands still; None if it never does.
+    """A motion in cluster space; duration_s is the time after which it is at rest; None if it never is.
 
     `value` returns c and its exact derivative c_dot, each (4n,), at t_s.
     """

@@ -334,7 +334,7 @@ def polygon(count: int, radius_m: float) -> Array:
 
 
 def turned(matrix: Array, c: Array) -> Array:
-    """Return a matrix (2, 2) times c (2,), with the same order of operations on every processor."""
+    """Return a matrix (2, 2) times c (2,)."""
     return np.array([matrix[0, 0] * c[0] + matrix[0, 1] * c[1], matrix[1, 0] * c[0] + matrix[1, 1] * c[1]])
 
 

@@ -35,7 +35,7 @@ from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.references.path import DEGREE, DURATION_MIN_S, SHARE, PathLimits, PiecewisePolynomial
 
 K_YAW_1_S = 1.0  # gain of the heading loop; design choice: a decade below the yaw loop's bandwidth
-DEVIATION_MAX_M = 2.0  # beyond it, the path is planned anew; design choice: above the tracking error without wind
+DEVIATION_MAX_M = 2.0  # beyond it, the path is replanned; design choice: above the tracking error without wind
 RISE_S = 0.5  # time in which climb and yaw rates rise from 0 to their limits; design choice: above both loops' lags
 HALVINGS = 60  # bisection steps: enough to determine a time to the last bit
 SHORT_S = 1e-9  # duration below which a part is omitted

@@ -6,7 +6,7 @@ takeoff, land
 hold: come to rest and hover
 goto {position_m, yaw_deg, speed_m_s}: fly to a position at a cruise speed (default: the limits) and stop there
 goto {places_m, yaw_deg, speed_m_s, radius_m}: fly through positions, passing each within radius_m; 0: stop at each
-goto {position_m, yaw_deg, over_s}: fly to a position on a minimum-snap path in over_s, or longer if the limits require
+goto {position_m, yaw_deg, over_s}: fly to a position on a minimum-snap path in over_s, or more if the limits require it
 follow {minimum_snap: [...], fit: true, ...}: fly to the start of a path, then along it; fields: FOLLOW_FIELDS
 """
 
