@@ -178,7 +178,7 @@ def flight_of(scenario: Scenario, drone: str) -> Flight:
     if from_s < earliest_s:
         needed = (
             f"must be >= {earliest_s + (approach.duration_s or 0.0):.2f}: "
-            f"it takes off at {settings.takeoff_s:g} s and climbs, then the"
+            f"the drone takes off at {settings.takeoff_s:g} s and climbs, and then the"
         )
         raise FlightError("start_s", f"is {settings.start_s:g}; {needed} approach takes {approach.duration_s:.2f} s")
     return Flight(hover, (Leg(from_s, approach, "approaching"), Leg(settings.start_s, path, "path")))

@@ -192,7 +192,7 @@ class ReferencePilot(Agent):
             self._mode_ns = self._t_ns - round(RESEND_S * 1e9)
             return None
         if self._state not in AIRBORNE or self._is_over or t_s >= self._land_s:
-            state = "about to land, or past its landing" if self._state in AIRBORNE else self._state
+            state = "about to land, or past its landing time" if self._state in AIRBORNE else self._state
             raise DroneRequestError(f"{self._drone} is {state}; must be flying its reference: request takeoff first")
         position, rate = self._flight.value(t_s)
         flight = requested_flight(parsed, t_s, position, rate, self._spec, self._limits)
