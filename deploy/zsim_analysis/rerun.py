@@ -274,7 +274,7 @@ class OutputComparison:
             self._note(output.t_ns, key, differing_field(*pair, output.__struct_fields__))
 
     def expire(self, t_ns: int) -> None:
-        """Count as different all outputs from more than `match_within_ns` before `t_ns` without a counterpart."""
+        """Treat every output from more than `match_within_ns` before `t_ns` without a counterpart as different."""
         for identity in [identity for identity in self._unmatched if identity[2] < t_ns - self._match_within_ns]:
             del self._unmatched[identity]
             self._note(identity[2], identity[0])

@@ -137,7 +137,7 @@ class RecordedProcess:
 class RadioSummary(Struct, frozen=True):
     """The reception between drones, averaged over a window."""
 
-    heard_mean: float  # expected number of drones that a drone hears: 4 with a loss of one half count as 2
+    heard_mean: float  # expected number of drones that a drone hears: 4 heard with a loss of one half count as 2
     connected_share: float  # share of time in which every drone can reach all others, directly or via relays
 
 
@@ -518,7 +518,7 @@ class FlightReader:
         """Return the commands that each drone obeyed, by time.
 
         A command was obeyed if the latest status names its source as commander, or if it names no commander and the
-        next commander, if any, is this source. Without any status, all commands count as obeyed.
+        next commander, if any, is this source. Without any status, all commands are deemed obeyed.
         """
         by_drone: defaultdict[str, list[tuple[Times, np.ndarray]]] = defaultdict(list)
         for (drone, source), rows in self._commands.items():
