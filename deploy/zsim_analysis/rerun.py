@@ -79,7 +79,7 @@ def rerun_record(
         own_fingerprint, recorded_by = fingerprint(), record.info.version
         if other_fingerprints := {record.info.fingerprint, *agents.fingerprints} - {own_fingerprint}:
             fingerprints_text = f"{', '.join(sorted(other_fingerprints))}; here {own_fingerprint}"
-            note(f"recorded with other code (fingerprint {fingerprints_text}): the same bits are not guaranteed")
+            note(f"recorded with different code (fingerprint {fingerprints_text}): the same bits are not guaranteed")
         if recorded_by != __version__:
             note(f"recorded by zsim {recorded_by}, flown again by {__version__}: the same bits are not guaranteed")
         if commands_only or agents.why_not:

@@ -160,7 +160,7 @@ def _nothing(reader: RecordReader, selection: MessageSelection) -> str:
     """Return why there is nothing to export."""
     count = sum(reader.topics().values())
     if not count:
-        return "contains no message; there is nothing to export"
+        return "contains no messages; there is nothing to export"
     criteria = [f"on {' '.join(selection.expressions)}"] if selection.expressions else []
     criteria += [f"from {selection.from_s:g} s"] if selection.from_s is not None else []
     criteria += [f"to {selection.to_s:g} s"] if selection.to_s is not None else []

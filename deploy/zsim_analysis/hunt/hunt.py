@@ -420,7 +420,7 @@ class _Hunt:
 
         margin_text = violating.worst.unknown or f"margin {violating.worst.value:.3g}"
         self._screen.say(
-            f"flight {violating.number} breaks {self._requirements[index].text} ({margin_text}); shrinking it"
+            f"flight {violating.number} violates {self._requirements[index].text} ({margin_text}); shrinking it"
         )
         yield from Shrinker(self._space, violates).shrink(violating.case)
 

@@ -200,7 +200,9 @@ def terminal_text(hunted: Hunted) -> Group:
     if found := summary.violation:
         columns = [Column("cause", "text"), Column("without it"), Column("with it alone")]
         rows = [[each.text, number(each.without), number(each.alone)] for each in found.causes]
-        title = f"{found.requirement}: broken in flight {found.number}, margin {found.unknown or number(found.margin)}"
-        lines.append(FittedTable(columns, rows, title, "margins; < 0: broken"))
-        lines.append(Text(printable(f"again: {command(hunted)}")))
+        title = (
+            f"{found.requirement}: violated in flight {found.number}, margin {found.unknown or number(found.margin)}"
+        )
+        lines.append(FittedTable(columns, rows, title, "margins; < 0: violated"))
+        lines.append(Text(printable(f"fly it again: {command(hunted)}")))
     return Group(*lines)

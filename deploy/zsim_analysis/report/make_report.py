@@ -280,7 +280,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
 
 def changed_text(changed: Sequence[str] | None) -> str:
     """Describe how a scenario differs from its file."""
-    return "not known" if changed is None else ", ".join(changed) or "nothing: as in its file"
+    return "not known" if changed is None else ", ".join(changed) or "nothing"
 
 
 def obstacle_text(distances_m: Mapping[str, float]) -> str:

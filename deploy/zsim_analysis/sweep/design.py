@@ -63,7 +63,7 @@ def difference(old: SweepPlan, new: SweepPlan) -> str | None:
     if old.document != new.document:
         keys = sorted(old.document.keys() | new.document.keys())
         other = next(key for key in keys if old.document.get(key) != new.document.get(key))
-        return f"its scenario has another {other}"
+        return f"its scenario has a different {other}"
     fields = []  # for each plan: values by path from the top of the scenario
     for plan in (old, new):
         parts = [text.partition("=") for text in plan.vary]
@@ -175,7 +175,7 @@ def parse(text: str, document: Mapping[str, Any] = NOTHING) -> Axis:
         return Grid(path, _grid_values(values))
     kind, arguments = drawn[1], drawn[2]
     if kind not in ("uniform", "normal"):
-        raise ValueError(f"draws by {kind}; must be uniform(low,high) or normal(mean,std)")
+        raise ValueError(f"draws from {kind}; must be uniform(low,high) or normal(mean,std)")
     try:
         first, second = (float(part) for part in arguments.split(","))
     except ValueError:
