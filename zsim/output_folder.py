@@ -98,7 +98,7 @@ def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> 
     others = sorted(each.name for each in folder.iterdir() if each.name not in own)
     if others and not force:
         names = ", ".join(others[:OTHERS_NAMED]) + (", …" if len(others) > OTHERS_NAMED else "")
-        raise RunError(f"{folder}: holds {names}; give --out an empty folder, or --force to {use} this one")
+        raise RunError(f"{folder}: contains {names}; give --out an empty folder, or --force to {use} this one")
 
 
 TEMPORARY = "zsim-temporary-"  # prefix of folders that a process keeps locked until it ends
@@ -154,7 +154,7 @@ def record_in(folder: Path) -> Path:
     """
     record = folder / RECORD
     if not record.is_file():
-        raise RunError(f"{folder}: holds no {RECORD}; give the folder of a run, as `zsim run` printed it")
+        raise RunError(f"{folder}: contains no {RECORD}; give the folder of a run, as `zsim run` printed it")
     return record
 
 

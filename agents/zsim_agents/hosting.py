@@ -100,7 +100,7 @@ def _check_agent(own: OwnAgent, where: str, scenario: Scenario) -> None:
 def check_plans(scenario: Scenario, source: str) -> None:
     """Check the plans of a scenario as its controllers and pilots do: expressions, names, templates, references.
 
-    In a run of several processes, controllers and pilots check the plans themselves: they load the mathematics anyway.
+    In a run of several processes, controllers and pilots check the plans themselves: they load the modules anyway.
 
     Raises:
         ScenarioError: a plan cannot be flown; one fault per line.

@@ -136,7 +136,7 @@ class Recorder:
             if ticker.is_alive():
                 ticker.join()
         if self._refused_count:
-            why = f"a record holds at most {CHANNELS_MAX} keys, and these are on further keys"
+            why = f"a record contains at most {CHANNELS_MAX} keys, and these are on other keys"
             self._print(f"{NAME}: {self._refused_count} messages are missing from the record: {why}")
         if self._participant.superseded:
             why = self._participant.end_reason

@@ -70,7 +70,7 @@ def fly(
 
 
 def with_agents(scenario: Scenario, own: Sequence[OwnAgent]) -> tuple[Scenario, list[Agent]]:
-    """Return a resolved scenario that waits for a user's agents and ends if one fails, and these agents.
+    """Return a scenario whose run waits for a user's agents and ends if one fails, and these agents.
 
     Raises:
         RunError: `own` is not a sequence, or one of its elements is not an agent.
@@ -105,7 +105,7 @@ class InProcessFlight:
         scenario: the resolved scenario.
         run_id, changed: as in `fly`.
         own: a user's agents, in addition to the scenario's: objects, or whatever `own_agent` accepts.
-        stock: whether the estimators and controllers of the scenario fly.
+        stock: whether the estimators and controllers of the scenario take part.
         steered: whether `send` is used, so that the caller takes part as `python.main`.
 
     Raises:
@@ -187,7 +187,7 @@ class InProcessFlight:
         self.bus.publish(caller, t_ns, [caller.command(t_ns, *command) for command in commands])
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
-        """Answer a request to the world, or to the controller of a cluster, between two gates."""
+        """Answer a request to the world, a controller or a pilot, between two gates."""
         if key == keys.CONTROL:
             return self.world.control(request)
         for agent in self.agents:
@@ -258,7 +258,7 @@ class _Progress:
         self._show_clock()
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
-        """Show nothing, as a gate has only truth, status and sensors."""
+        """Show nothing, as a gate has only truth, status and sensor messages."""
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
         if key not in self._watched:

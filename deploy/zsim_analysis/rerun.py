@@ -1,8 +1,8 @@
 """`zsim rerun`: flies a recorded run again from its own inputs and compares the truth with that in the record.
 
-First, world and agents are run again, with the inputs of others (operators, users' programs) from the record. If the
-truth differs, or the agents cannot be run again, the world is run alone, with all commands from the record: if that
-reproduces the recorded truth, the difference came from the agents.
+First, world and agents are run again, with the inputs of other participants (operators, users' programs) from the
+record. If the truth differs, or the agents cannot be run again, the world is run alone, with all commands from the
+record: if that reproduces the recorded truth, the difference came from the agents.
 """
 
 import math
@@ -79,7 +79,7 @@ def rerun_record(
         own_fingerprint, recorded_by = fingerprint(), record.info.version
         if other_fingerprints := {record.info.fingerprint, *agents.fingerprints} - {own_fingerprint}:
             fingerprints_text = f"{', '.join(sorted(other_fingerprints))}; here {own_fingerprint}"
-            note(f"recorded with other code (fingerprint {fingerprints_text}): the same bits are not guaranteed")
+            note(f"recorded with different code (fingerprint {fingerprints_text}): the same bits are not guaranteed")
         if recorded_by != __version__:
             note(f"recorded by zsim {recorded_by}, flown again by {__version__}: the same bits are not guaranteed")
         if commands_only or agents.why_not:
@@ -144,7 +144,7 @@ def _fly(record: recorded_run.RecordedRun, agents: recorded_run.RecordedAgents) 
     if agents.failure and not bus.failure:
         bus.answer_all()
     if not compared.instants:
-        raise RecordError(f"{reader.path}: {until or 'holds no truth'}; a run is flown again from its start")
+        raise RecordError(f"{reader.path}: {until or 'contains no truth'}; a run is flown again from its start")
     first, hashes = bus.outputs.first, bus.hashes.hexdigests()
     return RerunResult(compared, world.result()["truth_sha256"], until, bus.refused, first, hashes, bus.failure)
 
@@ -274,7 +274,7 @@ class OutputComparison:
             self._note(output.t_ns, key, differing_field(*pair, output.__struct_fields__))
 
     def expire(self, t_ns: int) -> None:
-        """Count as different all outputs from more than `match_within_ns` before `t_ns` without a counterpart."""
+        """Treat every output from more than `match_within_ns` before `t_ns` without a counterpart as different."""
         for identity in [identity for identity in self._unmatched if identity[2] < t_ns - self._match_within_ns]:
             del self._unmatched[identity]
             self._note(identity[2], identity[0])
@@ -418,7 +418,7 @@ class RerunBus(Bus):
         self._world.count_output(source)
 
     def _feed_event(self, event: run_messages.Event) -> None:
-        """Repeat what reached the world not as a message: deaths, overdue processes, requests, and withheld joins."""
+        """Repeat what did not reach the world as a message: deaths, overdue processes, requests, and withheld joins."""
         if event.kind in ADMISSIONS and event.source not in self._rerun:
             join_identity = _joined(event)
             if (join := self._withheld.pop(join_identity, None)) is not None:

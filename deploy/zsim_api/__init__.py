@@ -1,4 +1,4 @@
-"""The Python API: `zsim.run`, `zsim.Simulation` and others; see docs/python.md.
+"""The Python API: `zsim.run`, `zsim.Simulation` and more; see docs/python.md.
 
 Each name is imported from its module on first use, so that an onboard computer needs only the packages that it uses.
 """

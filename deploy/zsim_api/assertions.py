@@ -41,6 +41,7 @@ class Assertions(ABC):
         Raises:
             AssertionError: an RMS is larger (one line for each, with the largest error and its time) or unknown, the
                 run ended before the window did, or the formation was not engaged throughout the window.
+            RunError: the formation has no such variable.
         """
         __tracebackhide__ = True  # pytest then shows the line of the test, not this function
         run = self.run()

@@ -1,7 +1,8 @@
 """Control of drones from Python: commands, and requests to the pilot of a drone that flies a reference.
 
-Commands are passed to `Simulation.step` or sent by agents: messages of the contract in SI units; the publisher fills in
-stamp, number and source. Requests go to a drone that flies on its own: `sim.drone("drone1").goto((1, 2, 3))`.
+Commands are passed to `Simulation.step` or sent by agents; they are messages of the contract in SI units, whose time,
+sequence number and source the publisher fills in. Requests go to a drone that flies on its own:
+`sim.drone("drone1").goto((1, 2, 3))`.
 """
 
 import math

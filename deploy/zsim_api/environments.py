@@ -3,7 +3,7 @@
     env = zsim.parallel_env("step.yaml", reward=near_start, terminated=zsim.flipped, observe="estimate", step_s=0.1)
     observations, infos = env.reset(seed=3)
 
-An episode begins when all drones are in the air; it ends with the scenario's duration, if it is not terminated before.
+An episode begins when all drones are in the air; it ends with the scenario's duration, unless it is terminated earlier.
 The effect of an action becomes visible after the command's delay (`infos[agent]["command_delay_s"]`), as everywhere in
 zsim: see docs/python.md.
 """
@@ -51,7 +51,7 @@ def flipped(sim: Simulation, agent: str) -> bool:
 
 
 def far_away(distance_m: float) -> Ended:
-    """Return a condition that ends an agent's episode once one of its drones is `distance_m` away from its start."""
+    """Return a condition that ends an agent's episode once a drone is more than `distance_m` from its start."""
 
     def is_far(sim: Simulation, agent: str) -> bool:
         indices = [sim.names.index(drone) for drone in _drones(sim, agent)]

@@ -85,11 +85,11 @@ class Federation(Assertions):
         seed, set, law, estimator, out: as in `zsim.run`; an earlier run in `out` is replaced.
         agents: your own agents, as in `zsim.run`, or as strings for `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
         programs: command lines of your own programs, in any language, each a string or a list of words. `{endpoint}`,
-            `{federation}`, `{folder}` and `{name}` are replaced, and the environment has ZSIM_CONNECT, ZSIM_FEDERATION.
+            `{federation}`, `{folder}` and `{name}` are replaced, and ZSIM_CONNECT and ZSIM_FEDERATION are set.
             Simulated time starts only once every program with a name ("ground.main=python ground.py") has joined.
             A program that ends with a code other than 0 fails the flight, unless the test has killed it.
         options: further options of `zsim run`, such as "--hosted", or "--rate" and "1".
-        modules: further folders with the modules of named classes, beside those of the scenario.
+        modules: folders with the modules of named classes, in addition to those of the scenario.
 
     Attributes:
         endpoint, name: the endpoint of the world; the name of the federation.
@@ -485,7 +485,7 @@ class _Watch(Agent):
         moment: the moment of the newest gate; None before the first.
         raised: the exception that the condition raised.
         has_left: whether the participant has left the run.
-        ahead_s: time after the newest gate that the world cannot have computed yet [s]; None in realtime.
+        ahead_s: time from the newest gate to the first that the world cannot have computed yet [s]; None in realtime.
     """
 
     name = PROCESS

@@ -56,7 +56,7 @@ def run(
         scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
         seed, duration_s: replace those of the scenario.
         set: replaces fields of the scenario by path, as in `{"environment.wind.gust_m_s": 1.0}`.
-        agents: your own agents, beside the estimators and controllers of the scenario: subclasses of `zsim.Agent`, or
+        agents: your own agents, besides the estimators and controllers of the scenario: subclasses of `zsim.Agent`, or
             instances of them, which keep their state after the run unless they fly as processes. The run waits for
             them, and ends if one fails.
         law, estimator: classes that replace those of all clusters and drones; see docs/extending.md.
@@ -277,7 +277,7 @@ def fly_as_processes(scenario: Resolved, folder: Path) -> None:
     """Fly a resolved scenario as processes on this machine, into a new run folder.
 
     Raises:
-        RunError: nothing was recorded; the error has the last line that `zsim run` printed.
+        RunError: nothing was recorded; the error includes the last line that `zsim run` printed.
     """
     log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
     log.parent.mkdir(parents=True)

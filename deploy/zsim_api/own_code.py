@@ -191,7 +191,7 @@ class _Pickler(cloudpickle.Pickler):
 
 
 def _tokens(pickled: bytes, files: set[str]) -> Iterator[str]:
-    """Yield a pickle's content without files and the random identifiers of a process: the same for equal objects."""
+    """Yield a pickle's content without file names or a process's random identifiers: the same for equal objects."""
     class_tokens: dict[str, str] = {}
     for opcode, arg, _ in pickletools.genops(pickled):
         if not isinstance(arg, str):  # a frame's argument is its size in bytes, that of an array's content a bytearray

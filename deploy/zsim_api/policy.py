@@ -180,7 +180,7 @@ class Interface:
         """Return the commands by drone for the actions of agents; an agent without an action sends none.
 
         Raises:
-            UserCodeError: an action is of an unknown agent or the wrong shape, or is not finite; `by` names its source.
+            UserCodeError: an action is for an unknown agent, of the wrong shape or not finite; `by` names its source.
         """
         commands: dict[str, Command] = {}
         for agent, values in actions.items():

@@ -6,7 +6,7 @@ keeper is this file, run by path:
 
     python -I -S programs.py GRACE_S WORD...
 
-Standard input of the keeper is a pipe from its caller, which closes when the caller ends: the program then receives
+The keeper's standard input is a pipe from its caller, which closes when the caller ends: the program then receives
 SIGTERM, and is killed if it has not ended within the grace period. The keeper forwards SIGINT, SIGTERM and SIGHUP to
 the program's process group; SIGUSR1 kills the program and its descendants. Descendants that outlive the program are
 killed after the same grace period. (Outside Linux, only its process group is killed.) The exit code is the program's,
@@ -181,7 +181,7 @@ def keep(grace_s: float, command: list[str]) -> int:
 
 
 def _kill_children() -> None:
-    """Kill all children, known on Linux only, then their children, which in turn become children of this process."""
+    """Kill all children, then theirs, which in turn become children of this process; only Linux lists children."""
     while children := [pid for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]:
         for pid in children:
             with suppress(ProcessLookupError):

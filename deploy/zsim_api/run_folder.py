@@ -72,7 +72,7 @@ def locked(folder: Path) -> Iterator[Path]:
         opened = None if os.name == "nt" else os.open(folder, os.O_RDONLY)
     try:
         if opened is not None and not take_lock(opened):
-            raise RunError(f"{folder}: a run is flown into it now; end that one, or give --out another folder")
+            raise RunError(f"{folder}: a run is in progress in it; end that run, or give --out another folder")
         yield folder
     finally:
         if opened is not None:
@@ -100,9 +100,9 @@ def _make_room(out: Path, force: bool) -> None:
             _remove_run(out)
         elif any((out / JOURNAL).glob("*.entries")):
             options = f"`zsim run --continue {out}` continues it, --force replaces it, or give --out another folder"
-            raise RunError(f"{out}: holds a run that was interrupted; {options}")
+            raise RunError(f"{out}: contains an interrupted run; {options}")
         elif (out / RECORD).exists() or any(not log.is_file() or log.stat().st_size for log in (out / LOGS).glob("*")):
-            raise RunError(f"{out}: holds a run already; --force replaces it, or give --out another folder")
+            raise RunError(f"{out}: already contains a run; --force replaces it, or give --out another folder")
         refuse_others(out, (*LEFTOVERS, LOGS, JOURNAL), force, "fly into")
 
 
@@ -122,7 +122,7 @@ def _remove_run(folder: Path) -> None:
     if not (record.exists() or journaled or failed):
         return  # `logs`, `figures` and `journal` do not belong to a run
     if is_being_written(record):
-        raise RunError(f"{folder}: a run is flown into it now; end that one, or give --out another folder")
+        raise RunError(f"{folder}: a run is in progress in it; end that run, or give --out another folder")
     for name, suffixes in WRITTEN_INTO.items():
         for path in (folder / name).glob("*"):
             if path.suffix in suffixes and path.is_file():

@@ -315,7 +315,7 @@ def exposed_keys(inventory_file: InventoryFile) -> str | None:
             exposed += [path] if path.stat().st_mode & READABLE_BY_OTHERS else []
     if not exposed:
         return None
-    further = f" and {len(exposed) - 1} more of the private keys" if len(exposed) > 1 else ""
+    further = f" and {len(exposed) - 1} other private keys" if len(exposed) > 1 else ""
     return (
         f"{min(exposed)}{further} can be read by other users of this machine; chmod -R go= {shlex.quote(str(folder))}"
     )

@@ -90,7 +90,7 @@ def _host_faults(host: Host) -> Iterator[str]:
     if host.user is None:
         yield "user is missing; must be the user that the units run as; add it"
     elif not _home(host.user):
-        yield f"user is {show(host.user)}; must be letters, digits, `_`, `-` and `.`, at most 31"
+        yield f"user is {show(host.user)}; must consist of at most 31 letters, digits, `_`, `-` and `.`"
     for name, path in (("folder", host.folder), ("python", host.python or "/")):
         if not path.isprintable():
             yield f"{name} is {show(path)}; must be printable, because each line of a unit is an option"
@@ -272,7 +272,7 @@ def kubernetes(
 
 def _kubernetes_faults(planned: Sequence[PlannedProcess], text: str) -> list[str]:
     lines = [
-        f"hosts.{host} is not a name of a node; must be of a-z, 0-9, - and ., as `kubectl get nodes` lists it"
+        f"hosts.{host} is not the name of a node; must consist of a-z, 0-9, - and ., as `kubectl get nodes` lists it"
         for host in inv.used_hosts(planned)
         if not re.fullmatch(r"[a-z0-9]([a-z0-9.-]*[a-z0-9])?", host)
     ]

@@ -214,11 +214,11 @@ def test_a_realtime_run_is_rerun_by_the_world_alone(federation: Federation) -> N
 
 
 def test_a_missing_or_late_record_is_refused(federation: Federation) -> None:
-    """A folder holds no record, and a record begins in flight.
+    """A folder contains no record, and a record begins in flight.
 
     Expected: one line each, and the exit code for a user's error.
     """
-    rerun(federation, code=2, of=federation.folder).line("holds no run.mcap; give the folder of a run")
+    rerun(federation, code=2, of=federation.folder).line("contains no run.mcap; give the folder of a run")
     federation.run(PAIR, "--in-process", "--duration", "2").ends(with_code=0)
     late = doctored(federation.out, federation.folder / "late", from_the_second_second())
     rerun(federation, code=2, of=late).line("the record has nothing of 0.00 s; a run is flown again from its start")

@@ -39,7 +39,7 @@ def test_a_board_of_three_laws_is_flown_and_continued(
     assert held["shape_error_m"] < 0.6
     assert led["shape_error_m"] < 0.6
     assert led["messages_per_drone_s"] < 11 < held["messages_per_drone_s"]
-    assert {each.name for each in (out / "figures").iterdir()} == {"measures.png", "ways.png", "shapes.png"}
+    assert {each.name for each in (out / "figures").iterdir()} == {"measures.png", "paths.png", "shapes.png"}
     assert (out / "report.html").stat().st_size > 50_000
     assert "consensus" in (out / "board.md").read_text()
 

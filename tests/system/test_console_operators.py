@@ -196,7 +196,7 @@ def test_alarms_stay_until_acknowledged_and_failsafes_name_their_cause(
     # a fault without its magnitude is refused; the typed syntax is that of the terminal
     page.select_tab("Faults")
     page.open_folders()
-    see(page, "30 % of the messages between the processes world and estimator.drone1; no radio")
+    see(page, "30 % of the messages between the processes world and estimator.drone1; not by radio")
     parameters = page.page.get_by_role("textbox").last
     parameters.fill("")
     parameters.press("Enter")

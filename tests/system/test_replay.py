@@ -304,8 +304,8 @@ def test_a_truncated_record_is_played_as_far_as_it_goes(federation: Federation, 
     role.ends(with_code=0)
     assert re.search("^ended: .*record", role.text(), re.MULTILINE)
     for folder, options, text in (
-        (federation.folder, [], "holds no run.mcap"),
-        (flown, ["--from", "100"], "holds no gate from 100 s on; nothing can be played"),
+        (federation.folder, [], "contains no run.mcap"),
+        (flown, ["--from", "100"], "contains no gate from 100 s on; nothing can be played"),
         (flown, ["--keys", "a//b"], "key is 'a//b'"),
     ):
         refused = federation.start("replay", str(folder), "--listen", federation.endpoint, *options)

@@ -247,7 +247,7 @@ def test_nodes_survive_the_world_and_can_stop_the_bridge(federation: Federation,
         alone.line("left, the world has begun another run")
         truth.until(numbers)
         graph.run("rosnode", "kill", "/zsim")
-        alone.line("asks us to stop")
+        alone.line("requests a shutdown")
         alone.ends(with_code=0)
     finally:
         graph.close()

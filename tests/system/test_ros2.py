@@ -349,7 +349,7 @@ def test_nodes_receive_again_after_any_process_restarts(federation: Federation, 
     world = federation.world(NEVER, "--realtime")
     port = free_port()
     ours = federation.role("ros2", "--router", f"tcp/127.0.0.1:{port}")
-    ours.line("no router of ROS")
+    ours.line("no ROS router at")
     first = router(port)
     ours.line("ROS domain 0")
     ours.line("quad-1.a is quad_1_a in ROS")

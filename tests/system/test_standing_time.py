@@ -217,7 +217,7 @@ def test_readers_behind_a_router_that_take_nothing_do_not_slow_the_run(
     router.line("leads to")
     with reader(there, stopped=True) as stopped, reader(there, stopped=False) as idle:
         for pid in (stopped, idle):
-            router.line(f"router.site: pid {pid} .* took nothing")
+            router.line(f"router.site: pid {pid} .* read none")
         t_ns = watched.clock.now()[-1].message["t_ns"]
         watched.clock.until(lambda m: m["t_ns"] > t_ns + 5e9)
     watched.flies_on()

@@ -218,7 +218,8 @@ class ControlRequest(Struct, frozen=True):
 class ControlAnswer(Struct, frozen=True):
     """The answer to a request: whether it was carried out, the error if not, and the result.
 
-    `more` is the number of the next page of a replay; None if there is none."""
+    `more` is the number of the next page of a replay; None if there is none.
+    """
 
     ok: bool
     error: str = ""
@@ -251,7 +252,7 @@ class ClusterRequest(Message, frozen=True):
 def _infinite_fault(field: str, value: Any) -> str | None:
     """Return the fault of a field with arbitrary content if it contains a number that is not finite."""
     infinite = next((number for number in _numbers(value) if not math.isfinite(number)), None)
-    return None if infinite is None else f"{field} holds {infinite}; its numbers must be finite"
+    return None if infinite is None else f"{field} contains {infinite}; its numbers must be finite"
 
 
 def _numbers(value: Any) -> Iterator[float]:

@@ -107,7 +107,7 @@ def _packed(value: Any) -> Any:
         return value.item()
     if isinstance(value, np.ndarray) and value.dtype.str in TYPES:
         return Ext(ARRAY, _ENCODER.encode(_Array(value.dtype.str, value.shape, value.tobytes())))
-    raise TypeError(f"a state holds {type(value).__name__}; must be numbers, texts, bytes, lists, maps or arrays")
+    raise TypeError(f"a state contains {type(value).__name__}; must be numbers, texts, bytes, lists, maps or arrays")
 
 
 def _unpacked(code: int, data: memoryview) -> Any:

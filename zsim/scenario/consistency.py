@@ -396,7 +396,7 @@ def _own_sensor_faults(drones: _Entries) -> Iterator[Fault]:
             other, module = first.setdefault(name, (index, section[MODULE]))
             if module != section[MODULE]:
                 difference = f"is {show(section[MODULE])}, and {show(module)} in drones[{other}]"
-                yield f"drones[{index}].sensors.{name}.{MODULE}", f"{difference}; must be one for all drones"
+                yield f"drones[{index}].sensors.{name}.{MODULE}", f"{difference}; must be the same for all drones"
 
 
 def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
@@ -524,7 +524,7 @@ def _path_faults(reference: Any) -> Iterator[Fault]:
     """Yield conflicts between the fields of one drone's reference."""
     paths = [name for name in PATHS if getattr(reference, name)]
     if len(paths) > 1:
-        yield paths[1], f"is given together with {paths[0]}; must be only one of {', '.join(PATHS)}"
+        yield paths[1], f"is given together with {paths[0]}; give only one of {', '.join(PATHS)}"
     if paths and reference.start_s is None:
         yield "start_s", f"is missing; must say when {paths[0]} begins"
     if not paths and reference.start_s is not None:
@@ -571,7 +571,7 @@ def _process_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iter
         if kind and thing not in names and len(names) == len(entries):
             choices = listed(names) or f"a {kind} (the scenario has none)"
             allowed = f"must be {role}.NAME of {choices}, or a name of your own"
-            yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
+            yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is named {thing!r}; {allowed}"
 
 
 def _program_faults(programs: Mapping[str, Any], roles: Sequence[str]) -> Iterator[Fault]:
@@ -589,7 +589,7 @@ def _graph_faults(topology: Any, drones: list[str]) -> Iterator[Fault]:
     for hearer, senders in graph.items() if isinstance(graph, dict) else ():
         where = f"topology.graph.{hearer}"
         if hearer not in drones:
-            yield where, f"is no drone; {suggestion(hearer, drones)}must be one of {listed(drones)}"
+            yield where, f"is not a drone; {suggestion(hearer, drones)}must be one of {listed(drones)}"
         for k, name in enumerate(senders):
             others = [each for each in drones if each != hearer]
             if name not in others:

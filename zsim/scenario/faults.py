@@ -74,7 +74,7 @@ ROTOR = FaultParameter("rotor", "choice", "which rotor", choices=(*ROTORS, "all"
 _ONE_WAY = FaultParameter("one_way", "flag", "from the first to the second only", default=False, required=False)
 
 _RADIO = (
-    _number("range_m", "distance at which every second message is lost", "m", 0.0, 1e6, above=True, mildest=1e6),
+    _number("range_m", "distance at which half of the messages are lost", "m", 0.0, 1e6, above=True, mildest=1e6),
     _number("spread_m", "over which the loss grows", "m", 0.0, 1e6, above=True, default=5.0, required=False),
     FaultParameter(
         "place", "places", "of processes: a drone, or [x, y, z]; else the origin", "m", default={}, required=False
@@ -147,7 +147,7 @@ KINDS: dict[str, FaultKind] = {
     ),
     "gust": FaultKind(
         "world",
-        "the wind swells and ebbs: (1 - cos) / 2",
+        "the wind rises and falls as (1 - cos) / 2",
         (FaultParameter("velocity_m_s", "vector", "at its peak, in W", "m/s", -100.0, 100.0),),
         "ends",
     ),
@@ -170,7 +170,7 @@ KINDS: dict[str, FaultKind] = {
         "link", "messages are lost", (_number("probability", "of each message", "", 0.0, 1.0), _ONE_WAY)
     ),
     "link_cut": FaultKind("link", "no message arrives", (_ONE_WAY,)),
-    "radio": FaultKind("radio", "messages between a drone and others are lost with distance", _RADIO),
+    "radio": FaultKind("radio", "messages over the radio are lost more often at larger distances", _RADIO),
     PROCESS_KILL: FaultKind("process", "the process dies as if by kill -9", lasts="once"),
 }
 
@@ -436,7 +436,7 @@ def typed_parameters(texts: Sequence[str]) -> dict[str, Any]:
         if not equals or not re.fullmatch("[a-z][a-z0-9_]*", name):
             raise ValueError(f"{text[:40]!r} is not a parameter; must be NAME=VALUE, see `zsim fault kinds`")
         if name in OPTION_OF:
-            raise ValueError(f"{name} is not a parameter; give it by {OPTION_OF[name]}")
+            raise ValueError(f"{name} is not a parameter; give it with {OPTION_OF[name]}")
         if name in values:
             raise ValueError(f"{name} is given twice; must be given once")
         try:

@@ -83,7 +83,8 @@ def _forest(own: Forest, rng: np.random.Generator, starts: Sequence[Position], w
             raise DocumentError([f"{where}.{name} is {[low, high]}; must be [least, greatest]"])
     west, south, east, north = own.area_m
     if west >= east or south >= north:
-        raise DocumentError([f"{where}.area_m is {list(own.area_m)}; must be [west, south, east, north], rising"])
+        bounds_text = "[west, south, east, north] with west < east and south < north"
+        raise DocumentError([f"{where}.area_m is {list(own.area_m)}; must be {bounds_text}"])
     trunks = np.empty((own.trees, 3))  # x, y, radius
     clear = np.array([(x, y) for x, y, _ in starts]).reshape(-1, 2)
     entries: list[Entry] = []

@@ -206,7 +206,7 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
     if not isinstance(name, str):
         return reference
     if "pieces" in reference:
-        unsound.append((f"{where}.file", "is given together with pieces; must be only one of them"))
+        unsound.append((f"{where}.file", "is given together with pieces; give only one of them"))
         return reference
     try:
         pieces = pieces_of(plugin.beside(name), f"{where}.file")
@@ -407,7 +407,7 @@ def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
         axes = {axis: numbers[1 + k * TERMS : 1 + (k + 1) * TERMS] for k, axis in enumerate(AXES)}
         pieces.append({"duration_s": numbers[0], **axes})
     if wrong or not pieces:
-        raise DocumentError(wrong or [f"{where} is {show(str(path))}, which has no piece; must have one or more"])
+        raise DocumentError(wrong or [f"{where} is {show(str(path))}, which has no pieces; must have one or more"])
     return pieces
 
 

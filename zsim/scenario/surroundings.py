@@ -184,11 +184,11 @@ def unpacked(text: str) -> Array:
     try:
         data = reader.decompress(base64.b64decode(text, validate=True), TRIANGLES_MAX * each + 1)
     except (binascii.Error, zlib.error) as error:
-        raise ValueError(f"holds no triangles ({error})") from error
+        raise ValueError(f"contains no triangles ({error})") from error
     if len(data) > TRIANGLES_MAX * each:  # a short text may expand to any size
         raise ValueError(f"has more than {TRIANGLES_MAX} triangles; must have at most {TRIANGLES_MAX}")
     if not reader.eof:
-        raise ValueError("holds no triangles (truncated)")
+        raise ValueError("contains no triangles (truncated)")
     if not data or len(data) % each:
         raise ValueError(f"has {len(data)} bytes; must have {each} for each triangle")
     triangles = np.frombuffer(data, SINGLE).astype(float).reshape(-1, TRIANGLE)

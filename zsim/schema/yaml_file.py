@@ -47,7 +47,7 @@ def parse(text: str, source: str, example: str, refuse: type[DocumentError]) -> 
     except ValueError as error:
         raise refuse([f"{source}: {error}; see {example}"]) from error
     if not isinstance(document, dict):
-        holds = f"holds {show(document)}" if text.strip() else "is empty"
+        holds = f"contains {show(document)}" if text.strip() else "is empty"
         raise refuse([f"{source}: {holds}; must be a map as in {example}"])
     return document
 

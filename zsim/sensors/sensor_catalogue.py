@@ -309,7 +309,7 @@ def _from_kalibr(section: dict[str, Any], where: str, wrong: list[Fault]) -> dic
         flaws = [*faults(section[key], RateHz if len(path) == 1 else NonNegative, f"{where}.{key}")]
         inside = read if len(path) == 1 else read.get(path[0], {})
         if isinstance(inside, dict) and path[-1] in inside:
-            flaws.append((f"{where}.{key}", f"is given together with {'.'.join(path)}; must be only one of them"))
+            flaws.append((f"{where}.{key}", f"is given together with {'.'.join(path)}; give only one of them"))
         wrong += flaws
         if flaws or not isinstance(inside, dict):
             continue

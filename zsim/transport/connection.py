@@ -25,7 +25,7 @@ _OS_ERROR = re.compile(r"(?:os error |code: )(\d+)")
 _OTHER = "give another with --listen, and with --connect to the other commands"
 _LISTEN_FAULTS = {  # by errno
     errno.EADDRINUSE: f"another process listens there; {_OTHER}",
-    errno.EADDRNOTAVAIL: f"that is no address of this machine (`ip address` lists them); {_OTHER}",
+    errno.EADDRNOTAVAIL: f"that is not an address of this machine (`ip address` lists them); {_OTHER}",
     errno.EACCES: f"this user may not open it; ports below 1024 need root; {_OTHER}",
     errno.EPERM: f"this process may not open it; {_OTHER}",
     errno.EINVAL: f"the address lacks its network interface, as in tcp/[fe80::1%eth0]:7447; {_OTHER}",

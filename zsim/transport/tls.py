@@ -167,7 +167,7 @@ def _error_text(error: ssl.SSLError, endpoint: str) -> str | None:
     if "ALERT" in reason:
         return f"the listener refuses our certificate ({_reason(error)}); {REMEDY}"
     if "WRONG_VERSION" in reason or "RECORD_LAYER" in reason or "HTTP" in reason:
-        return f"the listener has no TLS; start it with --tls, or use tcp/ instead of {endpoint.split('/')[0]}/"
+        return f"the listener does not use TLS; start it with --tls, or use tcp/ instead of {endpoint.split('/')[0]}/"
     return None
 
 

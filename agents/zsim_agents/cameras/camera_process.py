@@ -1,6 +1,6 @@
 """Camera processes render pictures from the drones' true states; detector processes find hats in these pictures.
 
-A process that is too slow drops pictures and counts them; if the scenario lets cameras gate, the run waits for them.
+A process that is too slow drops pictures and counts them, unless the scenario makes the run wait for the cameras.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from zsim_agents.cameras.scene import DroneStates, scene_of
 
 TICK_S = 0.1  # interval between checks for a stop while no message arrives
 # Number of gates, beyond the command delay, by which cameras may lag the world before they drop pictures: tolerates
-# messages that arrive in bursts, and exceeds the slack of cameras that gate
+# messages that arrive in bursts, and exceeds the slack of cameras for which the run waits
 LAG_MAX_GATES = 5
 QUERY_TIMEOUT_S = 0.5  # timeout of queries, which the world and cameras answer within milliseconds
 BYE_DELAY_S = 0.1  # delay of the bye, whose higher priority would let it reach recorders before the last pictures
@@ -160,7 +160,7 @@ class CameraProcess(RunProcess):
         time.sleep(BYE_DELAY_S)
 
     def _catch_up(self) -> None:
-        """Request the newest truth if the world waits for this process, which may have missed its publication."""
+        """Request the newest truth, which this process may have missed, if the world waits for this process."""
         if self._participant.gates:
             self._arrived.extend(self._link.get(keys.truth("*"), timeout_s=QUERY_TIMEOUT_S))
             self.wake()

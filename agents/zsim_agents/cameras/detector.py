@@ -1,4 +1,4 @@
-"""Finds magenta hats in a simulated or real picture: bearing and range of each, with standard deviations. Pure.
+"""Finds magenta hats in a simulated or real picture: bearing and range of each, with standard deviations. No I/O.
 
 A pixel's magenta level is zero for orange, and varies linearly with the share of the pixel that a hat covers in front
 of grass, sky or hull: the covered share is the pixel's level divided by that of the hat alone. Direction and range
@@ -39,15 +39,15 @@ AREA_MIN_PX = 2  # minimum area of a region's box at half the resolution
 BLOBS_MAX = 100  # maximum number of regions to examine, the largest first
 MARGIN_PX = 4  # margin around a region, for its edge and the background
 CORE = 0.5  # minimum level of a hat's pixels, as a fraction of the maximum level
-CORE_MIN_PX = 12  # more fully covered pixels than this give the hat's level; with fewer, it is derived from the blur
+CORE_MIN_PX = 12  # number of fully covered pixels above which they give the hat's level; otherwise the blur gives it
 POINT_BLUR_PX2 = 1.1  # variance of a point's blur by lens, pixel, JPEG and the mean of nine pixels [px^2]; calibrated
 ROUND_MIN = 0.3  # minimum ratio of the smaller to the larger principal variance of a ball's image
 PIECE_GAP = 0.3  # maximum gap between two pieces of a ball over the ball's size; a rotor guard leaves a gap of 0.2
 SHARE_OF_EDGE_MIN = 0.3  # minimum visible share of a hat's edge
 DIAMETER_MIN_PX = 4.0  # minimum diameter of a hat [px]; the range of smaller hats has a bias that exceeds its sigma
-# Calibrated terms of the standard deviations of centre and diameter [px], added in quadrature: a factor of the edge's
-# roughness; px^2, divided by the diameter (for the centre also in proportion to the hidden part); px^3, divided by the
-# squared diameter (centre), or px (diameter).
+# Calibrated coefficients of the standard deviations of centre and diameter [px], whose terms are added in quadrature:
+# of the edge's roughness [1]; of 1 / diameter [px^2] (for the centre, times the hidden part); of 1 / diameter^2 [px^3]
+# (centre), or a constant [px] (diameter).
 CENTRE = 2.0, 6.5, 8.0
 DIAMETER = 2.0, 4.6, 0.1
 SQUARE_3, SQUARE_5 = (np.ones((side, side), np.uint8) for side in (3, 5))
@@ -61,7 +61,7 @@ EDGE_BLUR_PX2 = 1.1  # variance of the blur that moves a curved edge inwards [px
 TOLERANCE_PX, TOLERANCE_PX2, TOLERANCE_NOISE = 0.2, 1.0, 6.0
 POINTS_MIN = 5  # minimum number of points on a circle
 REFINEMENTS = 3  # number of refinements of the set of points on a circle
-OUTSIDE = 3.0  # cost of a point outside the circle, at most 1 inside: part of a ball may be hidden, but none protrudes
+OUTSIDE = 3.0  # cost of a point outside the circle (at most 1 inside): part of a ball may be hidden, but none protrudes
 UNOBSTRUCTED_CENTRE = math.sqrt(2.0 / DIRECTIONS)  # Outline.centre of an unobstructed ball
 SINGULAR = 1e-9  # points are collinear up to this ratio of the determinant to the squared trace of their second moments
 
@@ -155,7 +155,7 @@ class HatDetector:
         return merged
 
     def _hat(self, picture: Picture, box: _Box) -> Seen | None:
-        """Return the hat in a box at half the resolution; None if it cannot be measured, or the edge cuts it off."""
+        """Return the hat in a box at half the resolution; None if it cannot be measured, or the border cuts it off."""
         u, v, width, height = (2 * side for side in box)
         margin = MARGIN_PX + max(width, height) // 6
         u0, v0, u1, v1 = u - margin, v - margin, u + width + margin, v + height + margin

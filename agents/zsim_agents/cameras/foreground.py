@@ -1,4 +1,4 @@
-"""The foreground of a camera's picture: drones, hats, obstacles and surfaces. Pure.
+"""The foreground of a camera's picture: drones, hats, obstacles and surfaces. No I/O.
 
 A drone consists of hull, arms, motors, the sweeps of its rotor blades, and a hat. It looks as in the console
 (zsim_bridges.console.scene), with the AR.Drone's dimensions scaled by the length of the arms. All drones in a picture
@@ -416,7 +416,7 @@ def ball_images(
 
 
 def _boxes(view: View, centres_K: Array, displacements_px: Array, radius_m: float) -> dict[int, list[int]]:
-    """Return the boxes of the picture around those balls that are in it, by index."""
+    """Return the box in the picture around each ball that is in it, by index."""
     x, y, z = centres_K.T
     is_in_front = z >= radius_m + NEAR_M
     radius_px = view.lens.fx * radius_m / np.where(is_in_front, z - radius_m, np.inf) * (1 + np.hypot(x, y) / z)

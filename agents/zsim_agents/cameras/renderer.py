@@ -1,6 +1,6 @@
 """Renders the picture of a drone's camera from the true poses of all drones.
 
-Pure: equal inputs give bit-identical pictures.
+Rendering is deterministic: equal inputs give bit-identical pictures.
 
 The backdrop of ground and sky is a grey picture, which a map converts to colours: warping one channel takes a third of
 the time of warping three. Greys up to 150 are ground, and greys from HAZE on are sky. The ground repeats a square tile
@@ -30,7 +30,7 @@ from zsim_agents.cameras.scene import SHIFT, CameraMotion, DroneStates, Scene, V
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 BLUR_MIN_PX = 0.8  # minimum motion for which the ground is blurred
-WIDENING_MAX = 2.0  # maximum ratio of the undistorted to the final picture's size; beyond, edge pixels are repeated
+WIDENING_MAX = 2.0  # maximum ratio of the undistorted to the final picture's size; beyond it, edge pixels are repeated
 MARGIN = 64  # pixels by which the noise image exceeds the picture
 NOISE_MAX = 48.0  # maximum standard deviation of the amplified noise, in grey levels
 # No chroma subsampling: it would blur the colour of hats a few pixels wide
@@ -69,7 +69,7 @@ class Renderer:
     def __init__(
         self, camera: Camera, scene: Scene, carrier: int, seed: int, name: str, ground: Ground | None = None
     ) -> None:
-        gain = 1.0 / math.sqrt(scene.light)  # compensates for half of the light's deficit, in stops, from a clear day
+        gain = 1.0 / math.sqrt(scene.light)  # compensates, in stops, for half of the light missing from a clear day
         self._camera, self._scene, self._carrier = camera, scene, carrier
         self._exposure_s = camera.exposure_ms * 1e-3
         self._pose = camera_pose(camera)
@@ -179,7 +179,7 @@ class _Noise:
 
 
 def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
-    """Return an undistorted view of the lens's field, up to WIDENING_MAX, and the map that distorts its picture."""
+    """Return an undistorted view of the lens's field of view, up to WIDENING_MAX, and the map that distorts it."""
     lens = view.lens
     half = np.abs(view.plane).max(axis=(0, 1)) * (lens.fx, lens.fy)
     half_max = np.array([lens.width, lens.height]) * WIDENING_MAX / 2

@@ -1,4 +1,4 @@
-"""The scene of a picture, and the motion and the lens of the camera. All functions are pure.
+"""The scene of a picture, and the motion and the lens of the camera. No I/O.
 
 Frames: W, world (east, north, up); B, body of a drone; K, camera (x right, y down, z ahead).
 """

@@ -37,7 +37,7 @@ from zsim_agents.estimation.kalman_update import (
 from zsim_agents.estimation.measurement_update import correct_all
 from zsim_agents.estimation.strapdown import ATTITUDE, POSITION, VELOCITY, move_columns, recall_known
 
-SIGHTINGS_MAX = 1000  # maximum number used per gate; more are a flood
+SIGHTINGS_MAX = 1000  # maximum number used per gate; more indicate a flood
 PICTURES_KEPT = 256  # number of used pictures remembered: 1.4 s of those of 12 drones at 15 Hz
 SIGHTING = columns(  # sighting of one hat
     "SightingColumns",
@@ -45,6 +45,7 @@ SIGHTING = columns(  # sighting of one hat
         Field("drone", "1"),  # the observer
         Field("t_arrival", "s"),
         Field("t_sample", "s"),
+        Field("camera", "1"),  # index among the observer's cameras
         Field("p_BK", "m", 3),  # position of the camera
         Field("direction_B", "1", 3),
         Field("range", "m"),
@@ -71,7 +72,7 @@ class ClusterBanks:
     """A JointBank per cluster and an EstimatorBank per drone in no cluster, with the methods of one EstimatorBank.
 
     Attributes:
-        drones: drones whose sensors are needed; `receive` takes indices into it.
+        drones: drones whose sensors are needed; `receive` takes indices into this list.
     """
 
     def __init__(self, scenario: Scenario, drones: Sequence[str], gate_s: float) -> None:
@@ -133,7 +134,10 @@ class JointBank(EstimatorBank):
         hats = environment.hats if isinstance(environment.hats, Hats) else Hats()
         x, y, z = hats.position_m
         self._hat_B: Vector = float(x), float(y), float(z)
-        self._cameras = [{n: camera_pose(c).p_BK.tolist() for n, c in d.sensors.cameras().items()} for d in drones]
+        self._cameras = [  # for each drone, the index and the position of each camera
+            {name: (k, *camera_pose(camera).p_BK.tolist()) for k, (name, camera) in enumerate(cameras.items())}
+            for cameras in (drone.sensors.cameras() for drone in drones)
+        ]
         self._drones = {keys.sensor(drone.name, keys.SIGHTINGS): i for i, drone in enumerate(drones)}
         self._entries = PerPattern(self._sighting_entries)
         self._sightings: dict[Picture, tuple[str, list[Sighting]]] = {}  # this gate's, with the name of the detector
@@ -147,8 +151,8 @@ class JointBank(EstimatorBank):
             super().receive(i, sensor, message, t_arrival_s)
 
     def _receive_sightings(self, i: int, message: Sightings, t_arrival_s: float) -> None:
-        p_BK = self._cameras[i].get(message.camera)
-        if p_BK is None or not message.seen:
+        camera = self._cameras[i].get(message.camera)
+        if camera is None or not message.seen:
             return
         # Two detectors that search the same picture make the same errors, so only one is used. In one gate it is the
         # first by name, whichever arrived first, so that all estimators of the cluster use the same one.
@@ -156,9 +160,9 @@ class JointBank(EstimatorBank):
         other = self._sightings.get(picture)
         if picture in self._pictures_used or (other is not None and other[0] <= message.source):
             return
-        camera = i, t_arrival_s, message.t_sample_ns * 1e-9, *p_BK
+        exposure = i, t_arrival_s, message.t_sample_ns * 1e-9, *camera
         rows = [
-            (*camera, *seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m)
+            (*exposure, *seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m)
             for seen in message.seen[: SIGHTINGS_MAX - self._hat_count]
         ]
         self._hat_count += len(rows)
@@ -252,7 +256,7 @@ def use_sightings(rows: Rows, sightings: Array, hat_B: Vector) -> None:
     HJ, S, y = np.zeros((3, rows.joint.shape[0])), np.zeros((3, 3)), np.zeros(3)
     for m in range(sightings.shape[0]):
         sighting, i = sightings[m], int(sightings[m, SIGHTING.drone])
-        if m == 0 or sighting[0] != sightings[m - 1, 0] or sighting[2] != sightings[m - 1, 2]:
+        if m == 0 or not is_same_picture(sighting, sightings[m - 1]):
             claimed[:] = False
         j = identified_drone(rows, sighting, hat_B, claimed, HJ, S, y) if is_plausible(rows, sighting) else NO_DRONE
         if j == NO_DRONE:
@@ -262,6 +266,13 @@ def use_sightings(rows: Rows, sightings: Array, hat_B: Vector) -> None:
         rows.counts[i, COUNT.sightings_used] += 1
         rows.sighted[i, j] = sighting[SIGHTING.t_sample]
         correct_all(rows, HJ, S, y)
+
+
+@portable
+def is_same_picture(one: Array, other: Array) -> bool:
+    """Return whether two sightings are of the same drone, camera and exposure."""
+    is_same_camera = one[SIGHTING.drone] == other[SIGHTING.drone] and one[SIGHTING.camera] == other[SIGHTING.camera]
+    return is_same_camera and one[SIGHTING.t_sample] == other[SIGHTING.t_sample]
 
 
 @portable

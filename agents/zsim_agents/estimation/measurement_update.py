@@ -144,7 +144,7 @@ def set_variance(P: Array, k: int, variance: float) -> None:
 
 @portable
 def fuse(rows: Rows, i: int, P: Array, readings: Array, first: int, after: Array) -> Array:
-    """Test and use a drone's readings of a gate, in one stacked update unless very many; return the covariance.
+    """Test and use a drone's readings of a gate, in one stacked update unless they are many; return the covariance.
 
     Args:
         P: covariance of drone i, (n, n).
@@ -273,7 +273,7 @@ def write_variance(reading: Array, setting: Array, variance: Array, at: int) -> 
 
 @inlined
 def is_refuted(rows: Rows, i: int, kind: int) -> bool:
-    """Return whether a drone that recently saw drone i, or was seen by it, trusts its sensor: then drone i's errs."""
+    """Return whether a drone that recently saw drone i, or was seen by it, trusts its own sensor: then i's errs."""
     for j in range(rows.sighted.shape[0]):
         last_s = max(rows.sighted[i, j], rows.sighted[j, i])
         is_trusted = math.isnan(rows.nominal[j, NOMINAL.refused_since + kind]) and rows.counts[j, COUNT.used + kind] > 0
@@ -347,7 +347,7 @@ def _correct_jointly(
 ) -> Array:
     """Do the work of `correct` with the joint covariance, which corrects the states of all drones."""
     distances = np.zeros(ROWS_MAX)
-    put_block(rows.joint, i, P)  # it may have been inflated
+    put_block(rows.joint, i, P)  # P may have been inflated
     used = use_own(rows, i, H, variance, y, blocks, distances)
     selected = select_rows(rows, i, used, distances, blocks, kinds)
     if not used and selected.shape[0]:

@@ -5,7 +5,7 @@ clones of past positions and velocities: the reading is compared with the clone 
 correct the present state. S. I. Roumeliotis, J. W. Burdick, "Stochastic cloning: a generalized framework for processing
 relative state measurements", IEEE International Conference on Robotics and Automation, 2002.
 
-The functions from `reckon` on are dead reckoning: Madgwick's attitude filter, strapdown integration, and the growth of
+The functions from `reckon` on perform dead reckoning: Madgwick's attitude filter, strapdown integration, and growth of
 small errors. S. O. H. Madgwick, "An efficient orientation filter for inertial and inertial/magnetic sensor arrays",
 University of Bristol, 2010: quaternion rate (12), objective function of gravity (25), its Jacobian (26), fusion (33).
 Quaternions are Hamilton, w first, body to world; the world's z axis points up, so a body at rest feels +g along it.
@@ -240,7 +240,7 @@ def turn_heading(row: Array, gravity: float, angle: float) -> None:
 
 @portable
 def clone(rows: Rows, i: int, J: Array, first: int) -> None:
-    """Replace the oldest clone by the present position and velocity, if one is due.
+    """Replace the oldest clone with the present position and velocity, if one is due.
 
     J is the covariance of the drone's errors or of all drones' errors; `first` is the index of the drone's first state.
     """
@@ -568,7 +568,7 @@ def write_process_noise(Q: Array, walk: Array, variances: Vector, dt: float) -> 
 
 @inlined
 def heading_and_sigma(q: Quaternion, P: Array) -> tuple[float, float]:
-    """Return the heading [rad] and its standard deviation [rad] under the covariance P of the error state."""
+    """Return the heading [rad] and its standard deviation [rad], given the covariance P of the error state."""
     gradient = heading_gradient(matrix(q))
     variance = 0.0
     for i in range(3):

@@ -27,7 +27,7 @@ from zsim_agents.formation.trajectory import named_values, variable_of
 
 PEAK_RATE = 1.875  # peak rate of the minimum-jerk function of time over its mean rate
 DURATION_MIN_S = 2.0  # minimum duration, as for a ramp of the reference
-LAG_M = 0.7  # distance of a robot from its reference at which all wait; design choice: 1/3 of the minimum separation
+LAG_M = 0.7  # distance of a robot from its reference above which all wait; design choice: 1/3 of the minimum separation
 ARRIVAL_TOLERANCE_M = 0.5  # maximum distance from the goal on arrival; design choice: two sigma of an estimated side
 POSE_NAMES = ("x_c", "y_c", "z_c", "yaw")  # variables that are defined for robots in any arrangement
 

@@ -317,7 +317,7 @@ def grants_of(cluster: Cluster, environment: Environment) -> Grants:
 
 
 def granted(law: Any, grants: Grants) -> Any:
-    """Return a subclass of a law's class whose instances have these grants once `ControlLaw` is constructed."""
+    """Return a subclass of a law's class whose instances have these grants once `ControlLaw.__init__` has run."""
     attributes = {
         "_granted": grants,
         "__module__": law.__module__,
@@ -374,8 +374,8 @@ def guard(p_W: Array, v_W: Array, v_cmd_W: Array, limits: RobotLimits) -> tuple[
 
     The commanded rate d' of the distance between two robots is kept at d' >= -(d_near - separation_min) /
     guard_horizon: the distance predicted over the horizon stays above the minimum, and robots that are already closer
-    separate. d_near is the distance after the response time, during which an approach at the present velocities goes
-    on. Each robot of a pair takes half of the change; a few sweeps settle several pairs.
+    separate. d_near is the distance after the response time, during which an approach at the present velocities
+    continues. Each robot of a pair takes half of the change; a few sweeps settle several pairs.
     """
     guarded_W, order = v_cmd_W.copy(), np.empty((len(p_W), len(p_W)), np.int64)
     guards, alarms = hold_apart(p_W, v_W, guarded_W, order, *limits)
@@ -486,7 +486,7 @@ def note_alarms(p_W: Array, pairs: PairTable, separation_alarm_m: float, order: 
 
 @portable
 def separate(p_W: Array, v_W: Array, v_cmd_W: Array, i: int, j: int, limits: RobotLimits) -> bool:
-    """Make robots i and j separate at least at the required rate, each by half; return whether that took a change."""
+    """Make robots i and j separate at least at the required rate, half by each; return whether commands changed."""
     line_W = subtract(row(p_W, j), row(p_W, i))
     distance = norm(line_W)
     if distance >= reach(limits):

@@ -1,8 +1,8 @@
 """The phases of a formation flight: take-off, assembly, engaged flight on references, hold, landing.
 
 `Engagement` does not communicate: at each gate it takes estimates and returns commands; requests arrive between gates.
-Every engagement, resumption and reference is checked, every refusal gives a reason, and every reference starts at the
-present state of the formation.
+Every engagement, resumption and reference is checked, every refusal gives a reason, and every new reference starts at
+the estimate of the formation or continues the previous reference.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ class Engagement:
 
     def _submit(self, request: FlightRequest) -> str | None:
         if self._gate is None:
-            return "no gate has been seen yet; ask again when the simulation runs"
+            return "no gate has been processed yet; repeat the request when the simulation runs"
         try:
             self._grant(request, self._gate)
         except REFUSALS as refusal:
@@ -292,8 +292,8 @@ class Engagement:
             return None
         i, distance_m = self._assembly.farthest(gate.p_W)
         return (
-            f"{self.drones[i]} is {distance_m:.1f} m from its position, "
-            f"{self._assembly.remaining_s:.1f} s of the paths are left"
+            f"{self.drones[i]} is {distance_m:.1f} m from its position, with "
+            f"{self._assembly.remaining_s:.1f} s of the paths left"
         )
 
     def _assigned_positions(self, p_W: Array) -> AssignedPositions:

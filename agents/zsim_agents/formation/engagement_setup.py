@@ -57,7 +57,7 @@ from zsim_agents.formation.trajectory import Hold, Reference, Shifted, ramp_onto
 SEPARATION_M = 2.0  # distance between robots in a rehearsal; any value well above zero
 READY_S = 3.0  # minimum time from the take-off order to hovering drones and engagement; AR.Drones take 4 to 12 s
 SPEED_SLACK = 1.05  # factor on the speed limits; design choice: positions in the formation are off by some centimetres
-PATH_SLACK = 1.25  # factor on a path from the start; design choice: its length changes as drones drift in their climb
+PATH_SLACK = 1.25  # factor on a path from the start; design choice: its length changes as drones drift during the climb
 SEPARATION_SLACK = 0.9  # factor on the minimum separation and height; design choice, for the same reasons
 STEP_S, STEPS_MIN, STEPS_MAX = 0.1, 41, 3001  # sampling of a checked reference
 
@@ -91,7 +91,7 @@ def check_plan(scenario: Scenario, cluster: Cluster) -> None:
 
 
 class PlannedMotion(NamedTuple):
-    """The last reference of a plan, its earliest start `from_s`, and its end `until_s` by landing or end of the run."""
+    """The last reference of a plan, its earliest start `from_s`, and its end `until_s`: landing or the run's end."""
 
     space: ClusterSpace
     reference: Reference

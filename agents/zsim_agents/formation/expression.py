@@ -162,7 +162,7 @@ def _divide(a: Dual, b: Dual) -> Dual:
 
 def _in_domain(value: float) -> float:
     if not math.isfinite(value):  # checked at once, because min or max might discard the value
-        raise ValueError("outside of the domain of a function")
+        raise ValueError("outside the domain of a function")
     return value
 
 

@@ -97,7 +97,7 @@ class GateInput(Struct, eq=False):
     states: tuple[str, ...]
 
     def reordered(self, order: NDArray[np.intp]) -> GateInput:
-        """Return the gate with the robots reordered; `order` (n,) holds their present indices."""
+        """Return the gate with the robots reordered; `order` (n,) contains their present indices."""
         motion = self.p_W[order], self.yaw[order], self.v_W[order]
         accuracies = self.sigma_m[order], self.yaw_sigma[order], self.age_s[order]
         return GateInput(self.t_s, *motion, *accuracies, tuple(self.states[k] for k in order.tolist()))

@@ -211,9 +211,9 @@ class RampPlanner:
 class AssignedPositions:
     """The assigned positions p_W (n, 3) [m] in a held formation, and the motion of each robot to its own.
 
-    A robot far from its position (for example after landing and taking off again) distorts the shape so that it cannot
-    be led as a formation. Each robot first flies horizontally at its own height, below or above the others, then
-    vertically, at `share` of the robots' speed limits at most.
+    A robot far from its position (for example after landing and taking off again) distorts the shape so much that the
+    robots cannot be led as a formation. Each robot first flies horizontally at its own height, below or above the
+    others, then vertically, at `share` of the robots' speed limits at most.
     """
 
     def __init__(self, p_W: Array, gains: FormationGains, limits: RobotLimits, share: float) -> None:

@@ -52,7 +52,7 @@ class Variables(Protocol):
 
 
 class Reference(Protocol):
-    """A motion in cluster space; duration_s is the time after which it stands still; None if it never does.
+    """A motion in cluster space; duration_s is the time after which it is at rest; None if it never is.
 
     `value` returns c and its exact derivative c_dot, each (4n,), at t_s.
     """
@@ -285,7 +285,7 @@ class Variable(NamedTuple):
 
 
 def variable_of(space: Variables, name: object, where: str, at: str = "") -> Variable:
-    """Return the variable that a name denotes; an angle's may end in `_deg`. TrajectoryError: the name is unknown."""
+    """Return the variable that a name denotes; that of an angle may end in `_deg`. TrajectoryError: it is unknown."""
     text = str(name)
     angle = text.removesuffix(DEGREES)
     if text not in space.names and angle in space.names and space.in_radians[space.index(angle)]:

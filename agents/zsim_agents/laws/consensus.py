@@ -4,7 +4,7 @@
 
 Olfati-Saber, Fax, Murray, Consensus and cooperation in networked multi-agent systems, Proc. IEEE 95 (2007), with the
 displacement p_i - c_i as the agreement state. On a connected, undirected graph whose Laplacian has the second-smallest
-eigenvalue lambda_2, the errors about their mean decay at the rate k lambda_2, and the mean is constant.
+eigenvalue lambda_2, the errors about their mean decay at least at the rate k lambda_2, and the mean is constant.
 """
 
 from zsim_agents.laws.pilot import Array, Sight, added

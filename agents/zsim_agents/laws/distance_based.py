@@ -7,8 +7,8 @@ Krick, Broucke, Francis, Stabilisation of infinitesimally rigid formations of mu
 dV/dt = -sum |u_i|^2 / k, and the centroid is constant. The shape must be infinitesimally rigid: the rank of its
 rigidity matrix R, whose row for edge ij is z_ji at i and z_ij at j, is 2 n - 3 in the plane and 3 n - 6 in space. If
 there are exactly that many edges, errors near the shape decay at the rate 2 k lambda_min(R R^T). Convergence is local:
-collinear drones stay collinear, and a vertex with only two edges may settle on the wrong side. If the two ends of an
-edge desire different distances, the formation drifts.
+collinear drones stay collinear, and a vertex with only two edges may settle on the wrong side. If the two drones of an
+edge have different desired distances, the formation drifts.
 """
 
 from typing import Annotated

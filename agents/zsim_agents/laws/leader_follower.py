@@ -4,8 +4,8 @@
     follower    u_i = k sum_{j in N_i} ((p_j - p_i) - (c_j - c_i))    (1)
 
 The leader knows the reference and uses messages only to avoid collisions; followers do not know the reference, and
-receive messages of the leader only if it is a neighbour. With L_ff, the rows and columns of the followers in the
-Laplacian, their errors decay at the rate k lambda_min(L_ff). Without feed-forward, they lag a leader at velocity v by
+receive messages from the leader only if it is a neighbour. If L_ff is the followers' block of the Laplacian, their
+errors decay at the rate k lambda_min(L_ff). Without feed-forward, they lag behind a leader at velocity v by
 L_ff^-1 1 v / k, which grows along a chain. Mesbahi, Egerstedt, Graph theoretic methods in multiagent networks (2010),
 ch. 10.
 """

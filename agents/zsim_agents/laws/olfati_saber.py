@@ -1,11 +1,11 @@
-"""Flocking by Olfati-Saber: a cohesive lattice of spacing d, which aligns velocities and splits around obstacles.
+"""Flocking by Olfati-Saber: drones form a lattice of spacing d, align their velocities and split around obstacles.
 
     u_i = c1 sum phi_alpha(|z_ij|_s) n_ij + c2 sum a_ij (v_j - v_i)                     alpha: flockmates
         + c1b sum phi_beta(|z_ik|_s) n_ik + c2b sum b_ik (v_k - v_i)                    beta: obstacles
         - c1g (p_i - p_r) - c2g (v_i - v_r)                                             gamma: the common objective
 
 Olfati-Saber, Flocking for multi-agent dynamic systems: algorithms and theory, IEEE Trans. Automatic Control 51 (2006),
-Algorithms 2 and 3. u is an acceleration, which the pilot integrates to the commanded velocity. Each drone uses the
+Algorithms 2 and 3. u is an acceleration, which the pilot integrates into the commanded velocity. Each drone uses the
 messages of others within r; the last term uses the drone's own knowledge of the objective. Since several lattices are
 possible, the quality of the shape is measured by the deviation from d of the distances within r.
 """

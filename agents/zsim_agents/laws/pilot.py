@@ -97,7 +97,7 @@ class Sight(NamedTuple):
 
 
 class PilotParameters(Parameters):
-    """Common parameters of all laws; times are simulated, and speeds and distances horizontal."""
+    """Common parameters of all laws; times are simulated times, and speeds and distances are horizontal."""
 
     height_m: Annotated[float, Meta(gt=0, le=1000)] = 2.0
     takeoff_s: NonNegative = 2.0
@@ -233,8 +233,8 @@ class Pilot(Agent):
         """Return distance [m] and direction away (2,) of the obstacles and surfaces within reach beside the drone.
 
         The distance of a surface is that after which level flight meets its tangent plane at the nearest point. For a
-        wall, this is the distance to the wall; a slope counts as farther away the flatter it is, and level ground below
-        does not count at all.
+        wall, this is the distance to the wall; for a slope, it is greater the flatter the slope is. Level ground below
+        is ignored.
         """
         found = []
         for row in self._obstacles:
@@ -334,7 +334,7 @@ def polygon(count: int, radius_m: float) -> Array:
 
 
 def turned(matrix: Array, c: Array) -> Array:
-    """Return a matrix (2, 2) times c (2,), with the same order of operations on every processor."""
+    """Return a matrix (2, 2) times c (2,)."""
     return np.array([matrix[0, 0] * c[0] + matrix[0, 1] * c[1], matrix[1, 0] * c[0] + matrix[1, 1] * c[1]])
 
 

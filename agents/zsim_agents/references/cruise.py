@@ -9,11 +9,11 @@ in t1; the drone cruises at q for t2; it brakes along q in t3 = |q| / a and is a
 is a straight line with a trapezoidal speed profile: Biagiotti and Melchiorri, Trajectory Planning for Automatic
 Machines and Robots, Springer 2008, chapter 3.
 
-Let D lead from start to goal; then D - v t1/2 = q (t1/2 + t2 + t3/2). So t1 determines both the direction of q and its
-length: the cruise speed, or less where t2 would be negative, with |q|^2 / 2a + |q| t1/2 = |D - v t1/2|. t1 solves
-|q(t1) - v| = a t1. Since q(t1) is continuous and bounded, a solution exists, no later than the time of the largest
-change of velocity. Any velocity between two that satisfy the limits satisfies them too. Planned anew from any state
-on a path, the path to the same goal is the remainder of the old one.
+Let D be the displacement from start to goal; then D - v t1/2 = q (t1/2 + t2 + t3/2). So t1 determines both the
+direction of q and its length: the cruise speed, or less where t2 would be negative, with
+|q|^2 / 2a + |q| t1/2 = |D - v t1/2|. t1 solves |q(t1) - v| = a t1. Since q(t1) is continuous and bounded, a solution
+exists, no later than the time of the largest change of velocity. Any velocity between two that satisfy the limits
+satisfies them too. A path planned anew from any state on a path to the same goal is the remainder of that path.
 
 Horizontal and vertical limits differ: |.| above stands for the larger of the horizontal and the vertical component,
 each divided by its limit.
@@ -35,7 +35,7 @@ from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.references.path import DEGREE, DURATION_MIN_S, SHARE, PathLimits, PiecewisePolynomial
 
 K_YAW_1_S = 1.0  # gain of the heading loop; design choice: a decade below the yaw loop's bandwidth
-DEVIATION_MAX_M = 2.0  # beyond it, the path is planned anew; design choice: above the tracking error without wind
+DEVIATION_MAX_M = 2.0  # beyond it, the path is replanned; design choice: above the tracking error without wind
 RISE_S = 0.5  # time in which climb and yaw rates rise from 0 to their limits; design choice: above both loops' lags
 HALVINGS = 60  # bisection steps: enough to determine a time to the last bit
 SHORT_S = 1e-9  # duration below which a part is omitted

@@ -1,9 +1,9 @@
-"""The flights of drones with their own references: take-off, approach to a path, and the path. Pure.
+"""The flights of drones with their own references: take-off, approach to a path, and the path.
 
 A flight is checked in advance: its speeds, yaw rates and horizontal accelerations against the drone's limits, its
 heights, and its distances to other flights and to formations. When a formation engages, and how it approaches its
-target or trajectory, depends on its estimates; so distances to it are checked only from the time by which it must have
-arrived there.
+target or trajectory, depend on its estimates; distances to it are therefore checked only from the time by which it must
+have arrived there.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ if TYPE_CHECKING:
     from zsim_agents.formation.engagement_setup import PlannedMotion
 
 READY_S = 4.0  # minimum time from the take-off command to the first path; an AR.Drone takes at least 4 s to take off
-APPROACH_SHARE = 0.5  # usable share of the limits on the approach to a path that starts at rest, which need not be fast
+APPROACH_SHARE = 0.5  # usable share of the limits on an approach, which need not be fast, to a path that starts at rest
 ROUNDING = 1.0 + 1e-9  # tolerance for durations that just satisfy the limits
 HEIGHT_MIN_M = 0.2  # minimum height of a path: above most of the ground effect of the smallest drones
 SAMPLES_MAX, SAMPLE_S = 4001, 0.05  # sampling of a path's heights
 TOLERANCE_M = 1e-3  # tolerance of the minimum distance between two paths
 STEP_S = 0.05  # interval at which the distances between all paths are checked
 STEP_MIN_S = 1e-4  # minimum length of an interval that is still halved
-DELAY_MAX_S = 15.0  # of a formation: take-off takes up to 12 s (READY_S planned), engagement awaits estimates
+DELAY_MAX_S = 15.0  # of a formation: take-off takes up to 12 s (3 s are planned), and engagement awaits estimates
 COARSE_STEP_S, FINE_STEP_S = 0.1, 0.01  # interval of checks of distances to a formation: normally, and at close range
 APPROACH_MAX_M = 0.5  # maximum decrease within COARSE_STEP_S of the distance between a drone and a robot of a formation
 VARIABLE_NAMES = ("x", "y", "z", "yaw")
@@ -178,7 +178,7 @@ def flight_of(scenario: Scenario, drone: str) -> Flight:
     if from_s < earliest_s:
         needed = (
             f"must be >= {earliest_s + (approach.duration_s or 0.0):.2f}: "
-            f"it takes off at {settings.takeoff_s:g} s and climbs, then the"
+            f"the drone takes off at {settings.takeoff_s:g} s and climbs, and then the"
         )
         raise FlightError("start_s", f"is {settings.start_s:g}; {needed} approach takes {approach.duration_s:.2f} s")
     return Flight(hover, (Leg(from_s, approach, "approaching"), Leg(settings.start_s, path, "path")))
@@ -190,7 +190,7 @@ def approach_to(
     """Return the approach from a position and yaw (4,) to the start of a path.
 
     Raises:
-        FlightError: no path within the limits exists, usually since the path to be joined starts too fast.
+        FlightError: no path within the limits exists, usually because the path to be joined starts too fast.
     """
     position, rate = path.value(0.0)
     end = EndMotion(rate, np.zeros(4), np.zeros(4)) if rate.any() else None

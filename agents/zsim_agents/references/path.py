@@ -1,4 +1,4 @@
-"""Paths of one drone: position and rate over time, peak speeds and acceleration, and scaling to limits. Pure.
+"""Paths of one drone: position and rate over time, peak speeds and acceleration, and scaling to limits. No I/O.
 
 A path is a piecewise polynomial, such as a minimum-snap path, or a circle, helix or figure-8 flown in laps that begin
 and end at rest on the curve.
@@ -38,7 +38,7 @@ FACTOR_DIGITS = 3  # decimals to which the factor of a fitted path is rounded up
 SHARE = 0.8  # share of the drone's limits that a path may use, as in formations; the rest is left to the feedback
 # Minimum duration of a move (25 gates), maximum unless a longer one is requested, and its growth per step of the search
 DURATION_MIN_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1
-NEGLIGIBLE = 1e-9  # value below which a quantity counts as zero
+NEGLIGIBLE = 1e-9  # value below which a quantity is treated as zero
 RAMP_SHARE = 0.25  # duration of speeding up from rest, and of slowing down, as a share of a lap's
 Curve = Callable[[float], tuple[Array, Array]]
 """Maps the angle [rad] to the position (4,) and its derivative with respect to the angle."""
@@ -66,7 +66,7 @@ class Peaks(NamedTuple):
     at_s: tuple[float, float, float, float]
 
     def factor(self, limits: PathLimits) -> float:
-        """Return the factor by which to stretch the duration to just satisfy the limits; below 1, it may shrink."""
+        """Return the factor by which to stretch the duration to just satisfy the limits; below 1 if it may shrink."""
         speeds = max(peak / limit for peak, limit in zip(self[:3], limits[:3], strict=True))
         return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # acceleration scales as 1/t^2
 
@@ -108,7 +108,7 @@ class PiecewisePolynomial:
         return PiecewisePolynomial(durations, self.coefficients[:count])
 
     def peaks(self) -> Peaks:
-        """Return the peaks over all pieces, with times accurate to 1e-8 of a piece, which rounding permits."""
+        """Return the peaks over all pieces, with times accurate to 1e-8 of a piece, the limit set by rounding."""
         maxima = [(0.0, 0.0)] * 4
         for begin_s, duration_s, coefficients in zip(self.begins_s, self.durations_s, self.coefficients, strict=False):
             # in local time from 0 to 1, for good scaling
@@ -238,8 +238,8 @@ def move(
     It lasts `over_s`, or longer if the limits require it. It begins and ends at rest or in the given motions.
 
     Raises:
-        TrajectoryError: no path of an hour or less, or of `over_s`, satisfies the limits, usually since the motion at
-            an end exceeds them.
+        TrajectoryError: no path of an hour or less, or of `over_s`, satisfies the limits, usually because the motion
+            at an end exceeds them.
     """
     end_yaw = start[3] + math.remainder(goal[3] - start[3], math.tau)
     positions = np.array([start, [*goal[:3], end_yaw]])

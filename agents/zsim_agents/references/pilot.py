@@ -6,7 +6,7 @@ takeoff, land
 hold: come to rest and hover
 goto {position_m, yaw_deg, speed_m_s}: fly to a position at a cruise speed (default: the limits) and stop there
 goto {places_m, yaw_deg, speed_m_s, radius_m}: fly through positions, passing each within radius_m; 0: stop at each
-goto {position_m, yaw_deg, over_s}: fly to a position on a minimum-snap path in over_s, or longer if the limits require
+goto {position_m, yaw_deg, over_s}: fly to a position on a minimum-snap path in over_s, or more if the limits require it
 follow {minimum_snap: [...], fit: true, ...}: fly to the start of a path, then along it; fields: FOLLOW_FIELDS
 """
 
@@ -49,7 +49,7 @@ REQUESTS_MAX = 1000  # maximum number of requests between two gates, as for a co
 WITHOUT_ARGUMENTS = ("takeoff", "land", "hold")
 OPERATIONS = (*WITHOUT_ARGUMENTS, "goto", "follow")
 EXPRESSION_FIELDS = ("constants", "duration_s")
-# a reference's other fields are for scenarios
+# the other fields of a reference are allowed in scenarios only
 FOLLOW_FIELDS = (*PATHS, *EXPRESSION_FIELDS, "origin_m", "time_scale", "fit")
 
 
@@ -192,7 +192,7 @@ class ReferencePilot(Agent):
             self._mode_ns = self._t_ns - round(RESEND_S * 1e9)
             return None
         if self._state not in AIRBORNE or self._is_over or t_s >= self._land_s:
-            state = "about to land, or past its landing" if self._state in AIRBORNE else self._state
+            state = "about to land, or past its landing time" if self._state in AIRBORNE else self._state
             raise DroneRequestError(f"{self._drone} is {state}; must be flying its reference: request takeoff first")
         position, rate = self._flight.value(t_s)
         flight = requested_flight(parsed, t_s, position, rate, self._spec, self._limits)

@@ -198,7 +198,7 @@ class DroneServer:
         if datagram.startswith(AUTH_REQUEST):
             self._authentication.send(AUTH_REPLY, address)
         else:
-            self._refuse("a datagram on the authentication port is not a PARROT AUTH")
+            self._refuse("a datagram on the authentication port is not a PARROT AUTH request")
 
 
 class VideoServer:

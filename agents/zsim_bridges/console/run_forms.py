@@ -36,7 +36,7 @@ MESSAGES_LOST_PERCENT = 30.0
 TARGET_TEXTS = {
     "drone": "a drone",
     "world": "the world, hence all drones",
-    "link": "the messages between two processes A/B; a drone's radio is affected by the kind radio",
+    "link": "the messages between two processes A/B; a drone's radio is affected by faults of the kind radio",
     "radio": "the radio of all drones (target: world), or of a formation's drones",
     "process": "a process",
 }
@@ -175,7 +175,7 @@ class FaultForm:
         )
         link = f"world/estimator.{drone}"
         weak_text = f"rotor {rotor} of {drone}: {thrust:g} % of its thrust is left"
-        lost_text = f"{messages:g} % of the messages between the processes {link.replace('/', ' and ')}; no radio"
+        lost_text = f"{messages:g} % of the messages between the processes {link.replace('/', ' and ')}; not by radio"
         return {
             "GPS lost": ("gps_dropout", drone, {"probability": fixes / 100}, f"{fixes:g} % of the fixes of {drone}"),
             "Motor weak": ("rotor_efficiency", drone, {"rotor": rotor, "value": thrust / 100}, weak_text),

@@ -133,7 +133,7 @@ def check_not_reserved(key: str) -> None:
         raise DecodeError(f"{key[:80]!r}: is not a key; must be names separated by /")
     if is_reserved(key):
         raise ForbiddenError(
-            f"{key[:80]}: only the world or the process of that name writes here; a client may write on "
+            f"{key[:80]}: only the world or the process of that name publishes here; a client may publish on "
             f"{', '.join(CLIENT_KEYS).replace('*', '…')} and keys of its own"
         )
 

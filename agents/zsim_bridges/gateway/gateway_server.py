@@ -118,7 +118,7 @@ class Gateway:
     def run(self) -> RunAccess:
         """Return the current run, or raise a NoWorldError."""
         if self._run is None:
-            raise NoWorldError("there is no run now; the gateway waits for the next")
+            raise NoWorldError("there is no run now; the gateway is waiting for the next")
         return self._run
 
     def start_lockstep(self, session: LockstepSession, on_end: Callable[[str], None]) -> None:

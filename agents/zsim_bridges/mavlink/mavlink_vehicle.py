@@ -272,7 +272,7 @@ class MavlinkVehicle:
                 return flight.set_mode(FlightMode.HOLD) if first == 0.0 else flight.start_mission()
             case Cmd.DO_CHANGE_SPEED:
                 if not math.isfinite(second) or second <= 0.0:
-                    return f"a speed of {second} m/s"
+                    return f"invalid speed {second} m/s"
                 return parameters.put_setting(SPEED_SETTINGS.get(request.integer(0), "speed_m_s"), second)
             case Cmd.DO_SET_HOME:
                 position = state.position_m if first == 1.0 else _requested_position(state, request)
@@ -302,7 +302,7 @@ class MavlinkVehicle:
                 return self._send_message(AUTOPILOT_VERSION)
             case Cmd.SET_MESSAGE_INTERVAL:
                 if not math.isfinite(second):
-                    return f"an interval of {second} us"
+                    return f"invalid interval {second} us"
                 is_sent = self._telemetry.set_interval(request.integer(0), second)
                 return None if is_sent else Result.UNSUPPORTED
             case Cmd.GET_MESSAGE_INTERVAL:
@@ -319,7 +319,7 @@ class MavlinkVehicle:
         elif is_px4:  # PX4's altitude is above sea level
             altitude_m -= state.to_global(state.home_or_current_m)[2]
         if not 0.0 < altitude_m <= 10_000.0:
-            return f"take-off to {altitude_m:.1f} m above home"
+            return f"invalid altitude {altitude_m:.1f} m above home"
         return self.flight.take_off(altitude_m)
 
     def _reposition(self, request: Request) -> str | None:

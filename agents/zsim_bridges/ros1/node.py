@@ -217,7 +217,7 @@ class SlaveApi:
 
     def shutdown(self, caller: str, reason: str = "") -> Answer:
         """Stop, as requested by `rosnode kill` or by a master that gives the name to another node."""
-        self._node.request_shutdown(f"{str(caller)[:80]} asks us to stop: {str(reason)[:200]}".rstrip(": "))
+        self._node.request_shutdown(f"{str(caller)[:80]} requests a shutdown: {str(reason)[:200]}".rstrip(": "))
         return [OK, "", 0]
 
 

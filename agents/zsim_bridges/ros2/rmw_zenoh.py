@@ -267,7 +267,7 @@ class Publisher:
 
 
 CLUSTER_STATE = """\
-# Where a formation is, by the estimates of its drones, and where it is to be.
+# The state of a formation according to its drones' estimates, and its desired state.
 # names are the 4n cluster variables of n drones, in the order of value and desired [m, rad] and of desired_rate
 # [m/s, rad/s].
 std_msgs/Header header
@@ -287,8 +287,8 @@ string reason
 """
 
 NAVDATA = """\
-# The fields of ardrone_autonomy's Navdata, in its units and signs (x forward, y left, z up), with names as ROS 2 wants
-# them. Fields without a sample yet are NaN, or 0 in integers.
+# The fields of ardrone_autonomy's Navdata, in its units and signs (x forward, y left, z up), with names in the
+# style of ROS 2. Fields without a sample yet are NaN, or 0 in integers.
 std_msgs/Header header
 # [%]
 float32 battery_percent
@@ -300,7 +300,7 @@ float32 mag_y
 float32 mag_z
 # [Pa]
 int32 pressure
-# roll, pitch (nose down), yaw (counter-clockwise, from east) by the estimate [deg]
+# roll, pitch (nose down), yaw (counter-clockwise, from east) from the estimate [deg]
 float32 rot_x
 float32 rot_y
 float32 rot_z
@@ -334,7 +334,7 @@ PACKAGE = {  # a ROS 2 package that defines MESSAGES in ROS
 <package format="3">
   <name>zsim_msgs</name>
   <version>1.0.0</version>
-  <description>Messages of zsim's ROS 2 side</description>
+  <description>Messages of zsim's ROS 2 bridge</description>
   <maintainer email="nobody@example.org">zsim</maintainer>
   <license>Apache-2.0</license>
   <buildtool_depend>ament_cmake</buildtool_depend>

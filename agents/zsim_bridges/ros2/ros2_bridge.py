@@ -81,7 +81,7 @@ def serve(
                         )
                     )
                 except NoListenerError:
-                    waiting_text = f"no router of ROS on {network.router} yet, waiting for it; start rmw_zenohd there"
+                    waiting_text = f"no ROS router at {network.router} yet; waiting for one; start rmw_zenohd there"
                     bridge.report_once("router", waiting_text)
             if ros_link is not None and not is_advertised:
                 bridge.advertise_run(RosContext(ros_link, network.domain, wall_ns, bridge.count_refused))

@@ -183,7 +183,7 @@ class DriverProcess:
         self._observer.health.refused += 1
         self._ignored += 1
         if self._ignored == 1 or isinstance(command, flight_messages.Mode):
-            self._say(f"{keys.leaf(sample.key)} of {command.source} is not obeyed: {refusal}")
+            self._say(f"{keys.leaf(sample.key)} from {command.source} is not obeyed: {refusal}")
 
     def _on_request(self, query: Query) -> None:
         now_ns = self._clock.now_ns()
@@ -467,7 +467,9 @@ def check_host(host: str) -> None:
     try:
         socket.getaddrinfo(host, None)
     except (OSError, UnicodeError) as error:
-        raise RunError(f"the address is that of {host!r}, which is not a known host") from error
+        raise RunError(
+            f"the host {host!r} of the address is unknown; give a name that this machine resolves, or an IP address"
+        ) from error
 
 
 def check_run(info: Info, process: str, drone: str) -> None:

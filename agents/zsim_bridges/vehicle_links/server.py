@@ -241,4 +241,4 @@ def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
     if isinstance(answer, Unanswered):
         raise NoWorldError(f"{name}: the world of run {info.run_id} does not answer ({answer.error})")
     if not answer.ok:
-        raise RunError(f"{name}: the world does not set the pace to --rate {rate:g}: {answer.error}")
+        raise RunError(f"{name}: the world refuses --rate {rate:g}: {answer.error}")

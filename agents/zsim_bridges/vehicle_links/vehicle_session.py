@@ -205,13 +205,13 @@ class Failsafe:
                 self._setpoint = self.commander = None
                 return None
             case _:
-                return f"a driver does not take {type(command).__name__}; send velocity"
+                return f"a driver does not accept {type(command).__name__}; send velocity"
 
     def _take_off(self, now_ns: int, vehicle: AircraftState) -> str | None:
         if vehicle.state != "landed":
             return f"the aircraft is {vehicle.state}; it must be landed to take off"
         if self._is_outside(vehicle):
-            return "the aircraft stands outside the fence; carry it inside, or start the driver with another fence"
+            return "the aircraft is outside the fence; carry it inside, or start the driver with another fence"
         self._setpoint = self.commander = None
         self._enter_phase("taking_off", now_ns)
         return None

@@ -153,7 +153,7 @@ def _paths(board: Board, first_seed_rows: dict[tuple[str, str], Row]) -> style.R
         "Seen from above, x to the right; each drone in its colour, with a dot where it was last in the air; dashed: "
         "path of the reference's centre. All panels of a row have the same scale. No path: the flight failed."
     )
-    return style.ReportFigure("ways.png", "Paths of the drones, first seed", caption, figure)
+    return style.ReportFigure("paths.png", "Paths of the drones, first seed", caption, figure)
 
 
 def _box(board: Board, scenario: str, first_seed_rows: dict[tuple[str, str], Row]) -> tuple[Any, Any]:

@@ -104,7 +104,7 @@ def make_bundle(
             members[names.GATES] = expected.digests.csv()
         was_flown_here = fingerprint() == run.info.fingerprint and hosts.are_only(socket.gethostname())
         if not was_flown_here:
-            note("flown on another machine, or by another version, than this one: the bundle does not name the machine")
+            note("flown on a machine or by a version other than this one: the bundle does not name the machine")
         _add_figures(members, record_copy)
         manifest = Manifest(
             format=names.FORMAT,
@@ -435,23 +435,26 @@ To fly it again with zsim {zsim}{commit}, and check that every bit is the same:
 """
 WHAT = {
     names.SCENARIO: "the scenario, with all defaults and the seed",
-    names.LOCK: "versions of the installed packages when it was bundled",
+    names.LOCK: "versions of the packages installed when the flight was bundled",
     names.RECORD: "every message of the flight: MCAP, opened by `zsim report`, Foxglove, or any MCAP library",
     names.GATES: "in place of the record: a checksum of each key at each gate, by which a difference is found",
     names.RESULTS: "errors of the formation, separations, and deviations of the flight from its plan",
     names.FIGURES: "the figures of the report, each with its curves as a table",
     names.MODULES: "the scenario's own Python modules, which run when it is flown again",
-    names.MANIFEST: "this file's contents, with the SHA-256 of each part, and the results that a rerun must reproduce",
+    names.MANIFEST: "the contents of the bundle, the SHA-256 of each part, and the results that a rerun must reproduce",
 }
 
 
 def _readme(manifest: Manifest, members: Mapping[str, Any]) -> str:
     parts_of = dict.fromkeys(name.partition("/")[0] for name in sorted([*members, names.MANIFEST]))
-    own = f"It names code of its own ({', '.join(manifest.own_code)}), which is run only with `--trust`: read it first."
+    code_text = ", ".join(manifest.own_code)
+    own = f"The scenario names code of its own ({code_text}), which is run only with `--trust`: read it first."
     if any(Path(name).name.startswith(plugin.MADE) for name in members):
-        own += " It contains classes of a notebook as pickled by Python; only the same version of Python reads them."
+        own += (
+            " The bundle contains classes of a notebook, pickled by Python; only the same version of Python reads them."
+        )
     if manifest.not_run_again:
-        own += f"\n\nIts agents are not run again but their commands are read: {manifest.not_run_again}."
+        own += f"\n\nIts agents are not run again; their commands are read from the record: {manifest.not_run_again}."
     return README.format(
         name=manifest.name,
         zsim=manifest.zsim,
@@ -465,5 +468,5 @@ def _readme(manifest: Manifest, members: Mapping[str, Any]) -> str:
         manifest=names.MANIFEST,
         machine=", ".join(f"{name} {value}" for name, value in manifest.machine.items()) or "another machine",
         files="\n".join(f"| `{name}` | {WHAT[name]} |" for name in parts_of),
-        code=own if manifest.own_code or manifest.not_run_again else "It names no code of its own.",
+        code=own if manifest.own_code or manifest.not_run_again else "The scenario names no code of its own.",
     )

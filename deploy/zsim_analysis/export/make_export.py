@@ -44,9 +44,9 @@ DEFAULTS = {  # file names beside the record
     Format.FOXGLOVE: "foxglove.mcap",
 }
 MANIFEST = "export.json"  # marks a folder of tables
-MATLAB = b"MATLAB 5.0 MAT-file Platform: "  # first bytes of a file written by SciPy; MATLAB itself writes a comma there
+MATLAB = b"MATLAB 5.0 MAT-file Platform: "  # first bytes of SciPy's files; MATLAB's own have a comma before Platform
 MCAP, MCAP_LIBRARY = b"\x89MCAP", b"foxglove-sdk"  # a Foxglove export names its library, a record names zsim
-HEAD_MAX = 200  # number of first bytes of an MCAP file in which it names its library
+HEAD_MAX = 200  # an MCAP file names its library within this many first bytes
 LAYOUT = "-layout.json"  # suffix of the layout file beside a Foxglove export
 BLUEPRINT = ".rbl"  # suffix of the blueprint beside a Rerun export
 RERUN = b"RRF2"  # first bytes of a Rerun file
@@ -160,7 +160,7 @@ def _nothing(reader: RecordReader, selection: MessageSelection) -> str:
     """Return why there is nothing to export."""
     count = sum(reader.topics().values())
     if not count:
-        return "holds no message; there is nothing to export"
+        return "contains no messages; there is nothing to export"
     criteria = [f"on {' '.join(selection.expressions)}"] if selection.expressions else []
     criteria += [f"from {selection.from_s:g} s"] if selection.from_s is not None else []
     criteria += [f"to {selection.to_s:g} s"] if selection.to_s is not None else []
@@ -257,7 +257,7 @@ class WrittenTable(NamedTuple):
 
 
 class TableFolder:
-    """A folder of tables, one per message type, or per type and name; the first rows of each open its file."""
+    """A folder of tables, one per message type, or per type and name; each file is opened with its first rows."""
 
     def __init__(self, folder: Path, suffix: str, survey: TableSurvey) -> None:
         self._folder = folder

@@ -1,6 +1,6 @@
 """How viewers arrange a Foxglove file: a layout for Foxglove, a blueprint for Rerun.
 
-Both have the scene, the log, plots of the clusters' variables and of the drones' numbers, and the cameras. Rerun by
+Both show the scene, the log, plots of the clusters' variables and of the drones' numbers, and the cameras. Rerun by
 itself neither draws scenes nor plots fields, so its blueprint contains meshes of the drones, placed at the recorded
 poses, and names the field of each curve. A blueprint contains nothing of the flight: any Foxglove file with the same
 name and drones can be viewed with it. Rerun's own library writes it, if installed (tested with 0.41).
@@ -33,7 +33,7 @@ TAB = 3  # plots per tab
 DRONES_MAX = 12  # maximum number of plotted drones
 PICTURES, CALIBRATION = "_camera/image", "_camera/calibration"  # suffixes of topics
 PICTURES_MAX = 6  # maximum number of cameras shown: as many as the paper's three drones have
-TIMELINE = "message_log_time"  # Rerun's name of the MCAP file's log time: simulated time
+TIMELINE = "message_log_time"  # Rerun's name for the MCAP file's log time: simulated time
 ROTOR_CORNERS = 16  # corners of a rotor's disc
 # position and target of the eye in W; design choice: they show the paper's formation from the ground to 15 m
 EYE_M, TARGET_M = (14.0, -16.0, 14.0), (2.0, -2.0, 6.0)
@@ -55,7 +55,7 @@ Plot = tuple[str, list[Curve]]  # title and curves
 
 
 def variable_plots(variables: Mapping[str, Sequence[str]]) -> dict[str, list[Plot]]:
-    """Return plots by cluster, one for each of its first variables; `variables` are its numeric fields."""
+    """Return plots by cluster, for its first PLOTS_MAX variables; `variables`: numeric fields by cluster."""
     plots: dict[str, list[Plot]] = {}
     for cluster, fields in variables.items():
         topic, component = f"/cluster/{cluster}/variables", f"{PACKAGE}.Cluster_{tidy(cluster)}:message"
@@ -86,7 +86,7 @@ def _pictures(topics: Collection[str]) -> list[str]:
 
 
 def layout(run: foxglove_file.ConvertedRun) -> str:
-    """Return Foxglove's layout for a file as JSON."""
+    """Return a Foxglove layout for a file, as JSON."""
     states = [(_path(f"/cluster/{name}/variables", "phase"), name) for name in run.variables]
     tabs = []
     for cluster, plots in variable_plots(run.variables).items():
@@ -158,7 +158,7 @@ def has_rerun() -> bool:
 
 
 def write_blueprint(path: Path, application: str, run: foxglove_file.ConvertedRun) -> None:
-    """Write Rerun's blueprint for a file; `application` is Rerun's name for the file: its name without suffix."""
+    """Write a Rerun blueprint for a file; `application` is Rerun's name for the file: the file name without suffix."""
     os.environ.setdefault("RUST_LOG", "error")  # otherwise Rerun warns about unusual file names
     import rerun as rr
     import rerun.blueprint as rrb

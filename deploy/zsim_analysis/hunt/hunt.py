@@ -46,7 +46,7 @@ PLAN, TABLE, SCENARIO, VIOLATION = "hunt.json", "flights.csv", "violation.yaml",
 BUNDLE = "violation.zsim"
 OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, BUNDLE, "summary.json", "report.html", "figures", ".lock")
 SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages besides those of `shrink`
-SAME_BITS = "same_bits"  # quantity: whether truth is bit-identical to that of the same flight in which no process dies
+SAME_BITS = "same_bits"  # quantity: whether the truth is bit-identical to that of the flight without process deaths
 MISSES_MAX = 100  # successive draws that cannot be flown, after which --vary is deemed wrong; design choice
 DECIMALS = 6  # decimals of margins in the table
 
@@ -59,7 +59,7 @@ class HuntRequest(Struct, frozen=True):
 
     document: dict[str, Any]  # the scenario's document, with the overrides of the command line
     source: str  # name of the scenario's file, for messages
-    requirements: tuple[str, ...]  # comparisons, or functions of the user's own, `module:function`
+    requirements: tuple[str, ...]  # comparisons, or the user's functions, `module:function`
     out: Path
     seed: int = 1  # seed of the draws
     flights: int | None = None
@@ -120,7 +120,7 @@ class Violation(Struct, frozen=True):
     margin: float | None  # margin of the recorded flight, or else of the one found; None if it is unknown
     unknown: str  # the unknown quantity, or why the flight failed
     causes: list[CauseFound]
-    options: list[str]  # options with which `zsim run` of the scenario flies the shrunk flight
+    options: list[str]  # options with which `zsim run SCENARIO` flies the shrunk case
     truth_sha256: str | None
 
 
@@ -420,7 +420,7 @@ class _Hunt:
 
         margin_text = violating.worst.unknown or f"margin {violating.worst.value:.3g}"
         self._screen.say(
-            f"flight {violating.number} breaks {self._requirements[index].text} ({margin_text}); shrinking it"
+            f"flight {violating.number} violates {self._requirements[index].text} ({margin_text}); shrinking it"
         )
         yield from Shrinker(self._space, violates).shrink(violating.case)
 

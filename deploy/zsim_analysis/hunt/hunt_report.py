@@ -29,7 +29,7 @@ from zsim_analysis.hunt.space import KindSpace
 from zsim_analysis.report import figure_style as style
 from zsim_analysis.report.make_report import Picture, make_report, rendered, write_report
 
-QUARTERS = 4  # parts of a range, each with its number of flights
+QUARTERS = 4  # parts of a range, in each of which flights are counted
 KINDS_DRAWN = 24  # maximum number of kinds for which the matrix of pairs is drawn
 
 
@@ -159,7 +159,7 @@ def facts(request: HuntRequest, summary: HuntSummary) -> list[tuple[str, str]]:
 
 
 def kind_row(space: KindSpace, searched: Sequence[HuntFlight]) -> list[str]:
-    """Return a kind, how often it was flown, its smallest margin, and its targets and flights per quarter of ranges."""
+    """Return the row of a kind: its flights, smallest margin, targets, and flights by quarter of each range."""
     matching = [(each, fault) for each in searched for fault in each.case.faults if fault["kind"] == space.name]
     min_share = min((each.worst.share for each, _ in matching), default=None)
     targets = {fault["target"] for _, fault in matching}
@@ -200,7 +200,9 @@ def terminal_text(hunted: Hunted) -> Group:
     if found := summary.violation:
         columns = [Column("cause", "text"), Column("without it"), Column("with it alone")]
         rows = [[each.text, number(each.without), number(each.alone)] for each in found.causes]
-        title = f"{found.requirement}: broken in flight {found.number}, margin {found.unknown or number(found.margin)}"
-        lines.append(FittedTable(columns, rows, title, "margins; < 0: broken"))
-        lines.append(Text(printable(f"again: {command(hunted)}")))
+        title = (
+            f"{found.requirement}: violated in flight {found.number}, margin {found.unknown or number(found.margin)}"
+        )
+        lines.append(FittedTable(columns, rows, title, "margins; < 0: violated"))
+        lines.append(Text(printable(f"fly it again: {command(hunted)}")))
     return Group(*lines)

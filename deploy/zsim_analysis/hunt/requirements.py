@@ -79,7 +79,7 @@ class Requirement:
         return self._margin(self._tree, quantities)
 
     def faults(self, quantities: Mapping[str, Any]) -> list[str]:
-        """Return a line for each name that is no quantity of a flight, with the most similar quantity."""
+        """Return a line for each name that is not a quantity of a flight, with the most similar quantity."""
         unknown = [self._unknown(name, quantities) for name in self.names if name not in quantities]
         return [fault for text in unknown for fault in self._fault(text).faults]
 
@@ -208,7 +208,7 @@ def _operands(node: ast.AST) -> list[ast.expr]:
 
 
 def path_of(node: ast.AST) -> str:
-    """Return the dotted path of a name or attribute node; empty for others."""
+    """Return the dotted path of a name or attribute node; empty for any other node."""
     if isinstance(node, ast.Name):
         return node.id
     if isinstance(node, ast.Attribute):
@@ -217,7 +217,7 @@ def path_of(node: ast.AST) -> str:
 
 
 def quantities_of(document: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield path and value of every number, text, truth value and None of a summary, except in lists."""
+    """Yield the path and value of every number, text, truth value and None of a summary, except in lists."""
     if isinstance(document, Mapping):
         for name, value in document.items():
             yield from quantities_of(value, f"{prefix}.{name}" if prefix else str(name))

@@ -1,10 +1,10 @@
 """Shrinks a flight that violates a requirement: fewest causes, then smallest values, then the shortest flight.
 
 Causes are faults and fields that differ from the scenario. Sets of causes are flown in order of size, so that the
-result is minimal; if there are more than SUBSETS_MAX causes, single ones are removed first (delta debugging of Zeller
-and Hildebrandt, IEEE Transactions on Software Engineering 28, 2002, at its finest granularity). Every number is then
-bisected between its value and one without effect. The candidates of a step are flown in parallel, and the first one in
-order that violates the requirement is taken, so the result does not depend on which of them finishes first.
+result is minimal; if there are more than SUBSETS_MAX causes, they are first removed one at a time (delta debugging of
+Zeller and Hildebrandt, IEEE Transactions on Software Engineering 28, 2002, at its finest granularity). Each number is
+then bisected between its value and one without effect. The candidates of a step are flown in parallel, and the first
+one in order that violates the requirement is taken, so the result does not depend on which of them finishes first.
 """
 
 import math

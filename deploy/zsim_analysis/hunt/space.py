@@ -10,10 +10,10 @@ ranges: `gust velocity_m_s=1..6 for_s=2..8`.
 The strategy covers all small combinations of kinds, and exploits low margins. At least every second flight has a kind
 that has not been tried; once all kinds have been, a pair that has not been tried together; then a triple (Kuhn, Wallace
 and Gallo, IEEE Transactions on Software Engineering 30, 2004: few simultaneous conditions suffice to make software
-fail). Most others, and most flights once all combinations have been tried, are neighbours of the flights with the
-lowest margins, of which the lowest for each set of kinds is kept (MAP-Elites of Mouret and Clune, arXiv 1504.04909):
-numbers are moved slightly, or a fault is replaced or taken from another elite. Draws depend on the seed, the number of
-the flight and the margins of flights at least PENDING_MAX before it, but not on the number or speed of processes.
+fail). Most other flights, and most flights once all combinations have been tried, are neighbours of an elite, which is
+the flight with the lowest margin for a set of kinds (MAP-Elites of Mouret and Clune, arXiv 1504.04909): numbers are
+moved slightly, or a fault is replaced or taken from another elite. Draws depend on the seed, the number of the flight
+and the margins of flights at least PENDING_MAX before it, but not on the number or speed of processes.
 """
 
 import copy
@@ -91,7 +91,7 @@ class Knob(Struct, frozen=True):
         return self._compose(self._magnitude(rng.uniform()), _direction(rng, self.shape))
 
     def near(self, value: Any, rng: Generator, step: float) -> Any:
-        """Return a value moved by a normal draw, with a std of `step` times the range; for a choice, a new draw."""
+        """Return a value moved by a normal draw with a standard deviation of `step` ranges; a choice is redrawn."""
         if self.shape == "choice" or value is None:
             return self.draw(rng)
         position = self.position(value) + step * rng.normal()
@@ -483,7 +483,7 @@ class Strategy:
             self.elites[case.kinds] = Elite(margin, case)
 
     def _near(self, rng: Generator) -> Case:
-        """Return a neighbour of an elite, preferring those with lower margins."""
+        """Return a neighbour of an elite, preferring elites with low margins."""
         ranked = sorted(self.elites.values(), key=lambda elite: (elite.margin.share, elite.case.kinds))
         parent = self._pick(ranked, rng)
         faults, kinds = list(parent.faults), self.space.kinds

@@ -1,4 +1,4 @@
-"""Errors of each drone's estimates and of its motion against its reference; velocity responses; distances of drones."""
+"""Errors of the drones' estimates, and against their references; velocity responses; distances between drones."""
 
 from itertools import combinations
 from typing import NamedTuple
@@ -14,8 +14,8 @@ from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 
 SIGMAS = 2.0  # half-width of the drawn band in standard deviations
 DEGREES = 6  # degrees of freedom of a drone's NEES: position and velocity
-ESTIMATES_MAX = 200_000  # maximum number of estimates evaluated per flight, which takes about a second
-AIRBORNE_PHASES = ("approaching", "path", "holding")  # phases of a reference whose drone is to be in the air
+ESTIMATES_MAX = 200_000  # maximum number of estimates evaluated per flight; evaluating them takes about a second
+AIRBORNE_PHASES = ("approaching", "path", "holding")  # phases of a reference in which its drone should be airborne
 POSITION, YAW = (0, 1, 2), 3  # columns of errors and of velocities: x, y, z, heading
 INSTANTS = 1500  # number of times at which distances are computed, more than a figure has pixels across
 
@@ -165,7 +165,7 @@ class Distances(NamedTuple):
 
 
 class Separations(NamedTuple):
-    """Limits of distances [m]: the controllers' margin and alarm, and the contact of two hulls; None if unknown."""
+    """Distance limits [m]: the controllers' margin and alarm, and the contact of two hulls; None if unknown."""
 
     margin_m: float | None
     alarm_m: float | None
@@ -173,7 +173,7 @@ class Separations(NamedTuple):
 
 
 def distances(flight: RecordedFlight, pairs_max: int) -> Distances | None:
-    """Return the distances between simulated drones, by pair if at most `pairs_max`; None if there are none."""
+    """Return the distances between simulated drones, also by pair if there are at most `pairs_max`; None if unknown."""
     tracks = [track for track in flight.tracks if len(track.t_ns) and not track.external]
     t_ns, indices = common_instants(tracks)
     if len(tracks) < 2 or not len(t_ns):
@@ -194,7 +194,7 @@ def distances(flight: RecordedFlight, pairs_max: int) -> Distances | None:
 
 
 def separations(flight: RecordedFlight) -> Separations:
-    """Return the limits of distances in a flight's scenario: the largest of its clusters and of any two hulls."""
+    """Return the distance limits of a flight's scenario: the largest among its clusters and among pairs of hulls."""
     gains = [cluster.gains for cluster in flight.scenario.clusters] if flight.scenario else []
     margin_m = max((each.separation_min_m for each in gains), default=None)
     alarm_m = max((each.separation_alarm_m for each in gains), default=None)

@@ -71,7 +71,7 @@ class Formation:
         return (self.t_s >= window_s[0]) & (self.t_s <= window_s[1])
 
     def judged(self, window_s: tuple[float, float]) -> NDArray[np.bool_]:
-        """Return a mask (K,) of a window's engaged samples; in others, the desired value may merely be the estimate."""
+        """Return a mask (K,) of a window's engaged samples; in the others, the desired value may be the estimate."""
         return self.within(window_s) & self.engaged
 
     def engaged_share(self, window_s: tuple[float, float]) -> float | None:
@@ -197,7 +197,7 @@ def _min_distance_m(tracks: list[Track]) -> float | None:
 
 
 class GoalErrors(NamedTuple):
-    """Errors (K, 4n) of a formation against its plan's target; NaN once the plan leads elsewhere.
+    """Errors (K, 4n) of a formation against its plan's target; NaN once its trajectory or landing starts.
 
     The paper's Figure 5 shows these errors, which include the climb from the ground.
     """

@@ -32,12 +32,12 @@ from zsim_analysis.reading.recorded_run import scenario_of, search_modules
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 TRUTH_WIDTH = 13  # position, velocity, orientation, angular velocity
-CONNECTED_MIN = 0.5  # minimum reception probability of a connected link; this defines the range
+CONNECTED_MIN = 0.5  # minimum reception probability, apart from loss, of a connected link: that at range_m
 
 
 @dataclass
 class Track:
-    """True motion of one drone, W and B as in the contract."""
+    """True motion of one drone, in the frames W and B of the contract."""
 
     name: str
     t_ns: Times  # (T,) times of the truth, ascending and unique
@@ -135,9 +135,9 @@ class RecordedProcess:
 
 
 class RadioSummary(Struct, frozen=True):
-    """The reception of drones, averaged over a window."""
+    """The reception between drones, averaged over a window."""
 
-    heard_mean: float  # expected number of drones that a drone hears: 4 with a loss of one half count as 2
+    heard_mean: float  # expected number of drones that a drone hears: 4 heard with a loss of one half count as 2
     connected_share: float  # share of time in which every drone can reach all others, directly or via relays
 
 
@@ -147,7 +147,7 @@ class RadioHistory:
     Attributes:
         t_ns: times, ascending, (K,).
         heard: expected number of other drones whose messages arrive, (K, N).
-        connected: whether the graph of links of at least CONNECTED_MIN, without `loss`, was strongly connected, (K,).
+        connected: whether links with a reception >= CONNECTED_MIN, `loss` aside, strongly connect the drones, (K,).
         share: probability that a message of drone j arrives at drone i, mean over time, (N, N).
 
     Args:
@@ -208,7 +208,7 @@ class RecordedFlight:
     # estimates and commands by drone; empty unless requested
     estimates: dict[str, DroneEstimates] = field(default_factory=dict)
     commands: dict[str, VelocityCommands] = field(default_factory=dict)
-    others: dict[str, int] = field(default_factory=dict)  # in process: number of messages by key that no report reads
+    others: dict[str, int] = field(default_factory=dict)  # in process: message counts of keys that no report reads
     cpu_s: float | None = None  # CPU time of this process from the first gate to the last; None for a record
     radio: RadioHistory | None = None  # None if the scenario has no radio
     references: dict[str, DroneReferences] = field(default_factory=dict)  # of drones that fly on their own, by drone
@@ -518,7 +518,7 @@ class FlightReader:
         """Return the commands that each drone obeyed, by time.
 
         A command was obeyed if the latest status names its source as commander, or if it names no commander and the
-        next commander, if any, is this source. Without any status, all commands count as obeyed.
+        next commander, if any, is this source. Without any status, all commands are deemed obeyed.
         """
         by_drone: defaultdict[str, list[tuple[Times, np.ndarray]]] = defaultdict(list)
         for (drone, source), rows in self._commands.items():

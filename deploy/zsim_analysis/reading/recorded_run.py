@@ -1,8 +1,8 @@
 """The record of a run, opened to be replayed or flown again: its messages, its processes, and the inputs of each gate.
 
-A record keeps the order in which messages passed the world: those before a gate's clock message were received before
-that gate was integrated. Two flights are compared by hashes of their messages: `OutputHashes`, of all outputs of agents
-by key, show whether they are identical; `GateDigests`, checksums by key and gate, show where they first differ.
+A record keeps the order in which messages passed through the world: those before a gate's clock message were received
+before that gate was integrated. Two flights are compared by hashes of their messages: `OutputHashes`, of all outputs of
+agents by key, show whether they are identical; `GateDigests`, checksums by key and gate, show where they first differ.
 """
 
 import csv
@@ -87,14 +87,14 @@ def is_answer(key: str) -> bool:
 
 
 def answered_until_ns(reader: RecordReader, info: messages.Info) -> int:
-    """Return the last gate [ns] whose answers are all in the record, as the last recorded gate needed them.
+    """Return the last gate [ns] whose answers are all in the record, because the last recorded gate needed them.
 
     Raises:
         RecordError: the record has no gate.
     """
     clock = reader.last(keys.CLOCK)
     if clock is None:
-        raise RecordError(f"{reader.path}: holds no gate")
+        raise RecordError(f"{reader.path}: contains no gate")
     return clock.t_ns - info.gate_ns - info.command_delay_ns
 
 
@@ -361,7 +361,7 @@ class GateDigests:
             sums[key] = sums.get(key, 0) + zlib.crc32(payload) & 0xFFFFFFFF
 
     def csv(self) -> bytes:
-        """Return a CSV table: `t_ns`, then a column for each key with 8 hexadecimal digits, or empty."""
+        """Return a CSV table: `t_ns`, then a column per key, whose cells are 8 hexadecimal digits or empty."""
         names = sorted({key for sums in self._sums.values() for key in sums})
         file = io.StringIO()
         writer = csv.writer(file, lineterminator="\n")

@@ -199,7 +199,7 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
 def _refusal_before(event: Event, flight: RecordedFlight) -> str:
     """Return why a drone's latest refused command was refused, if that may explain an event; otherwise empty.
 
-    Only the first of many equal refusals are events; the last of these says that further ones are only counted.
+    Only the first of many identical refusals are events; the last of these says that further ones are only counted.
     """
     commands = f"drone/{event.subject}/cmd/"
     for each in reversed(flight.events):
@@ -439,7 +439,7 @@ def _strayed(
         away_m = np.linalg.norm(track.p_W[track_rows] - positions_W[state_rows, robots], axis=1)
         for intervention in _interventions(drone, flight):
             away_m[intervention.covers(t_ns)] = 0.0
-        yield from _far(drone, t_ns, away_m, "its place in the formation", flight)
+        yield from _far(drone, t_ns, away_m, "its position in the formation", flight)
 
 
 def _far(drone: str, t_ns: NDArray[np.int64], away_m: Array, goal: str, flight: RecordedFlight) -> Iterator[Shortfall]:

@@ -44,7 +44,7 @@ ABSENT = "–"
 RUNS_PER_TABLE = 2  # runs side by side with all their statistics; more do not fit the page
 THERE = "there"  # cell of a named item, such as a drone, that another run does not have
 RUNS_NAMED, NAMES_MAX = 3, 100  # number of runs in the page's file name, and of characters of their names
-MARK, HEAD_BYTES = b": comparison</title>", 4_000  # identifies comparison pages, within that many first bytes
+MARK, HEAD_BYTES = b": comparison</title>", 4_000  # identifies comparison pages, within their first HEAD_BYTES
 UNPLANNED = "†"  # after the name of a run that was not flown as planned
 
 
@@ -208,7 +208,7 @@ def scenario_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
 
 
 def flattened(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
-    """Yield path and value of every leaf; named items are identified by their names, independent of order.
+    """Yield the path and value of every leaf; named items are identified by their names, whatever their order.
 
     Items without names are identified by their indices, each with all its fields as one value; empty lists are omitted.
     """

@@ -275,7 +275,7 @@ def time_marks(flight: RecordedFlight, formation: Formation | None = None) -> Ti
 
 
 def _faults(flight: RecordedFlight) -> Iterator[Band]:
-    """Yield the injected faults; those without an end last until the end of the flight."""
+    """Yield the injected faults; those without an end last to the flight's end, kills until the process is back."""
     ends = {event.data.get("id"): event.t_ns for event in flight.events if event.kind in ("fault_end", "fault_clear")}
     for index, event in enumerate(flight.events):
         if event.kind == "fault":
@@ -309,7 +309,7 @@ def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
 
 
 def draw_marks(axes: Iterable[Axes], marks: TimeMarks, extend: bool = True) -> None:
-    """Draw marks into time axes that already contain their data; with `extend`, extend the axes to the whole run."""
+    """Draw marks on time axes that already contain their data; with `extend`, extend the axes to the whole run."""
     for each in axes:
         if extend and marks.span_s:
             each.update_datalim([(t_s, 0.0) for t_s in marks.span_s], updatey=False)

@@ -216,7 +216,7 @@ MARGIN_SHARE = 0.06
 OUTLINES = 7  # maximum number of outlines of a formation in the plan, few enough to be distinguishable
 # smallest distance between outlines, as a share of the formation's size; closer ones would overlap
 OUTLINE_DISTANCE_MIN = 0.6
-RING_MAX = 4  # maximum number of drones that their outline connects in order; that of more is their convex hull
+RING_MAX = 4  # maximum number of drones whose outline connects them in order; for more, it is their convex hull
 
 
 def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure:
@@ -396,7 +396,7 @@ def name_states(figure: Figure, tracks: Sequence[Track]) -> None:
 # Errors of estimates
 
 ERRORS = ("x (m)", "y (m)", "z (m)", "yaw (rad)")
-INSIDE = 0.9545  # probability of a normally distributed error within SIGMAS standard deviations
+INSIDE = 0.9545  # probability that a normally distributed error is within SIGMAS standard deviations
 CONSISTENT = "95 % of χ²"  # range of NEES that contains 95 % of the samples of a consistent estimator
 BAND_GREY = "#9aa5b1"  # different from the colours of all time marks
 FLOOR = 0.1  # smallest NEES drawn on its logarithmic axis

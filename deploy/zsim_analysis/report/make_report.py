@@ -1,7 +1,7 @@
 """Makes the report of a run: record in; summary.json, figures/*.png and report.html out.
 
-A page is self-contained, figures included; it loads nothing from the network. Comparisons and sweeps are written by
-the same functions.
+A page is self-contained, figures included; it loads nothing from the network. The same functions write the pages of
+comparisons and sweeps.
 """
 
 import base64
@@ -280,7 +280,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
 
 def changed_text(changed: Sequence[str] | None) -> str:
     """Describe how a scenario differs from its file."""
-    return "not known" if changed is None else ", ".join(changed) or "nothing: as in its file"
+    return "not known" if changed is None else ", ".join(changed) or "nothing"
 
 
 def obstacle_text(distances_m: Mapping[str, float]) -> str:

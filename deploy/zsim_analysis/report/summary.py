@@ -306,7 +306,7 @@ def _notes(
         yield "The scenario has no cluster: there is no table of errors."
     own = flight.info.fingerprint if flight.info else ""
     if other_processes := [p.name for p in flight.processes if own and p.fingerprint and p.fingerprint != own]:
-        text = "computed with other code than the world (fingerprint); the same bits are not guaranteed."
+        text = "computed with different code from the world's (fingerprint); the same bits are not guaranteed."
         yield f"{', '.join(other_processes)} {text}"
 
 
@@ -402,7 +402,7 @@ def terminal_text(summary: RunSummary) -> Group:
     tables = [table(summary, name) for name in summary.clusters]
     if summary.tracking:
         title = f"Errors against the drones' references from {span_text(summary.window_s)}"
-        caption = "true = truth − reference, in the air; on path: not on the way to it, nor holding a place"
+        caption = "true = truth − reference, in the air; on path: neither on the way to it nor holding a position"
         content = tracking_table(summary)
         columns = [TRACKING_COLUMNS[name] for name in content.columns]
         tables.append(FittedTable(columns, content.rows, title, caption, lines=HEAVY_HEAD))
@@ -537,7 +537,7 @@ def _is_printed(drone: Drone) -> bool:
 
 
 def _is_led(cluster: Cluster) -> bool:
-    """Return whether the plan of a cluster of ROBOTS leads from the ground to equation (3)."""
+    """Return whether the plan of a cluster of ROBOTS leads from the ground to the target of equation (3)."""
     plan = cluster.plan
     if plan.takeoff_s is None or plan.trajectory is not None:
         return False

@@ -104,7 +104,7 @@ class DaskPool:
                         try:
                             row = future.result()
                         except KilledWorker:
-                            row = failed_row(task, "several workers died in it; see Dask's allowed-failures")
+                            row = failed_row(task, "several workers died while flying it; see Dask's allowed-failures")
                         except CancelledError:
                             raise
                         except Exception as error:  # raised by `fly` if every further run would fail as well

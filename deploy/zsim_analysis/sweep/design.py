@@ -53,7 +53,7 @@ class SweepPlan(Struct, frozen=True, kw_only=True):
     runs: int  # number of runs; a plan with more runs begins with the same ones
     records: bool = False  # whether every run keeps its record
     changed: tuple[str, ...] | None = None  # overrides `a.b.c=value` of the command line; None: not known
-    version: str = __version__  # version of zsim; others may give other numbers
+    version: str = __version__  # version of zsim; other versions may give different results
 
 
 def difference(old: SweepPlan, new: SweepPlan) -> str | None:
@@ -63,7 +63,7 @@ def difference(old: SweepPlan, new: SweepPlan) -> str | None:
     if old.document != new.document:
         keys = sorted(old.document.keys() | new.document.keys())
         other = next(key for key in keys if old.document.get(key) != new.document.get(key))
-        return f"its scenario has another {other}"
+        return f"its scenario has a different {other}"
     fields = []  # for each plan: values by path from the top of the scenario
     for plan in (old, new):
         parts = [text.partition("=") for text in plan.vary]
@@ -175,7 +175,7 @@ def parse(text: str, document: Mapping[str, Any] = NOTHING) -> Axis:
         return Grid(path, _grid_values(values))
     kind, arguments = drawn[1], drawn[2]
     if kind not in ("uniform", "normal"):
-        raise ValueError(f"draws by {kind}; must be uniform(low,high) or normal(mean,std)")
+        raise ValueError(f"draws from {kind}; must be uniform(low,high) or normal(mean,std)")
     try:
         first, second = (float(part) for part in arguments.split(","))
     except ValueError:
@@ -437,7 +437,7 @@ def _refuse_overlap(path: str, steps: FieldPath, fields: dict[FieldPath, str]) -
 
 
 def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
-    """Return the faults of the number of runs; `all_known`: no axis, perhaps of drawn values, was refused."""
+    """Return the faults of the number of runs; `all_known`: no variation was refused."""
     runs, points = design.plan.runs, design.points
     if runs > RUNS_MAX:
         return [f"--runs is {runs}; must be at most {RUNS_MAX}"]

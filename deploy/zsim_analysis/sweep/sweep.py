@@ -41,7 +41,7 @@ PLAN_METADATA = b"zsim_sweep"  # key of the plan in the table's metadata
 PLAIN_S = 10.0  # wall time between progress lines if there is no terminal
 BAR = 20  # width of the progress bar [characters]
 FAILURES_MAX = 5  # maximum number of failure reasons printed
-UNMEASURED_MAX = 5  # maximum number of runs without the user's metrics printed
+UNMEASURED_MAX = 5  # maximum number of runs reported as lacking the user's metrics
 _TYPES: dict[Any, pa.DataType] = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 
 

@@ -408,7 +408,7 @@ class GridAxis:
     """The x axis of a sweep over several points: numeric values to scale, all others side by side.
 
     Attributes:
-        field: path of the field on the axis; None if the points stand side by side.
+        field: path of the field on the axis; None if the points are side by side.
         series: labels of the combinations of the other fields; [""] if there are no other fields.
         positions: position of each point, by its number.
     """

@@ -6,7 +6,7 @@ compute further numbers from the flight:
     def metrics(flight: RecordedFlight) -> float | Mapping[str, float]
     def metrics(run: zsim.Run) -> float | Mapping[str, float]
 
-The name of the argument decides what is passed: for `flight`, the arrays of a RecordedFlight; for any other name, the
+The name of the parameter decides what is passed: for `flight`, the arrays of a RecordedFlight; for any other name, the
 recorded run.
 
 A returned number becomes the column `metrics.FUNCTION`; a mapping, one column `metrics.NAME` for each of its names. A
@@ -49,7 +49,7 @@ from zsim_analysis.report.summary import RunSummary, summarise
 from zsim_analysis.sweep.design import METRICS
 
 METRIC = "metrics."  # prefix of the columns of the user's metrics
-FLIGHT = "flight"  # name of an argument that takes a RecordedFlight
+FLIGHT = "flight"  # name of a parameter that takes a RecordedFlight
 METRICS_MAX = 100  # maximum number of metrics that one function may return
 _NAME = re.compile(r"[A-Za-z]\w{0,63}", re.ASCII)
 
@@ -297,7 +297,7 @@ def metrics_of(task: Task, flight: RecordedFlight) -> tuple[dict[str, float | No
 
 
 def _takes_run(name: str) -> bool:
-    """Return whether a user's function takes the recorded run, that is, its argument is not named `flight`."""
+    """Return whether a user's function takes the recorded run, that is, its parameter is not named `flight`."""
     try:
         arguments = signature(plugin.load_function(name, METRICS)).parameters
     except (DocumentError, TypeError, ValueError):  # reported when the function is called

@@ -25,7 +25,7 @@ from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, engaged_column
 Samples = NDArray[np.float64]
 
 LEVEL = 0.95  # confidence level of all intervals
-RUNS_MIN = 5  # minimum number of runs for an interval; design choice: with 2, it is 13 times their difference
+RUNS_MIN = 5  # minimum number of runs for an interval; design choice: with 2, its width is 13 times their difference
 SEPARATION = "min_separation_m"
 OBSTACLE_DISTANCE = "min_obstacle_distance_m"
 _NUMBER = re.compile(r"(?<![\w.])\d[\d.]*")  # a number in a text, but not in a name such as drone1

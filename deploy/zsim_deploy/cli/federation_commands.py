@@ -95,7 +95,7 @@ def pub(
     key: Annotated[str, Argument(help="Key, e.g. drone/drone1/cmd/velocity.")],
     message: Annotated[str, Argument(help='JSON, e.g. \'{"velocity_m_s": [1, 0, 0], "yaw_rate_rad_s": 0}\'.')],
     count: Annotated[int, Option("--count", "-n", min=1, help="Number of times to send it.")] = 1,
-    rate_hz: Annotated[float, Option(callback=positive, max=1000, help="Rate, per wall second.")] = 10.0,
+    rate_hz: Annotated[float, Option(callback=positive, max=1000, help="Messages per wall second.")] = 10.0,
 ) -> None:
     """Send a command to a drone; t_ns, seq and source are filled in. Exit code 1 if the world refuses it."""
     from zsim_deploy.cli import inspection

@@ -311,7 +311,9 @@ def sweep(
     try:
         rows = fly_plan(plan, folder, workers, dask, force)
     except KeyboardInterrupt:
-        note(f"interrupted; the same command with --out {folder} continues the sweep; its table so far is there")
+        note(
+            f"interrupted; the same command with --out {folder} continues the sweep; the table so far is in that folder"
+        )
         sys.exit(INTERRUPTED)
     failures = [row["failure"] for row in rows if row["failure"]]
     shortfall_texts = [row["shortfall"] for row in rows if row.get("shortfall") and not row["failure"]]

@@ -69,14 +69,16 @@ def ask(federation: str, op: str, **args: Any) -> Any:
         try:
             line.connect(str(path))
         except OSError as error:
-            raise RunError(f"no `zsim up` of federation {federation!r} runs on this machine; start one") from error
+            raise RunError(
+                f"no `zsim up` of federation {federation!r} is running on this machine; start one"
+            ) from error
         _refuse_if_foreign(path.parent)
         try:
             line.sendall(json.dumps({"op": op, "args": args}).encode() + b"\n")
             with line.makefile("rb") as stream:
                 answer = json.loads(stream.readline())
         except TimeoutError as error:
-            raise RunError(f"`zsim up` has not answered {op} within {ANSWER_S:g} s; look at its terminal") from error
+            raise RunError(f"`zsim up` has not answered {op} within {ANSWER_S:g} s; check its terminal") from error
         except (OSError, ValueError) as error:
             raise RunError(f"`zsim up` ended before it answered {op}") from error
     if not answer["ok"]:

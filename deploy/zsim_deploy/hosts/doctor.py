@@ -220,7 +220,7 @@ def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str
             free = f"{facts['free_bytes'] / 1e9:.1f} GB are free on its disk"
             warnings.append(f"{name}: {free}; a record of an hour takes about 1 GB")
     computing = {name: report for name, report in reports.items() if NEEDED_TO_COMPUTE in report.facts["machine"]}
-    return faults, [*warnings, *_different_fingerprints(computing), *_lacked_packages(computing)]
+    return faults, [*warnings, *_different_fingerprints(computing), *_missing_packages(computing)]
 
 
 def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
@@ -237,7 +237,7 @@ def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
     yield f"the hosts have different code, so identical results are not guaranteed (fingerprints {listed}); {causes}"
 
 
-def _lacked_packages(reports: dict[str, HostReport]) -> Iterator[str]:
+def _missing_packages(reports: dict[str, HostReport]) -> Iterator[str]:
     """Yield a warning for each host without a package that others compute with: it is slower, with the same results."""
     for name, report in reports.items():
         all_parts = {part for each in reports.values() for part in each.facts["machine"]}

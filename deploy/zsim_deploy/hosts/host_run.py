@@ -56,13 +56,13 @@ PREPARE_S = 30.0  # for copying files to all hosts
 CLEAN_S = 5.0  # for a host to remove the run's folder; a lost host delays the end by at most twice this
 JOIN_S = 60.0  # for connecting and checking a host that the run has not used so far
 IMPORT_S = 20.0  # for a Python to import the modules of a role; a small computer takes 5 s
-BRING_S = 30.0  # for copying a certificate to a host
+COPY_S = 30.0  # for copying a certificate to a host
 LEAVE_S = 20.0  # for a process that was just replaced to end; normally it takes a second
 LOOK_S = 0.1  # polling interval while waiting for that end
 ORDER_S = 5.0  # time limit for the supervisor, which polls every 50 ms, to carry out an order
 BEAT_S = 1.0  # interval of the launcher's heartbeat
 ORPHAN_S = 60.0  # without a heartbeat for this long, a process ends itself; shorter link outages are survived
-LEND_S = 60.0  # time limit for copying the files of a restarted process; as long as a link may be down
+RECOPY_S = 60.0  # time limit for copying the files of a restarted process; as long as a link may be down
 KILL_S = 5.0  # for a kill to reach the host, which takes a few round trips
 
 LOST = -1000  # exit code of a process whose end is unknown
@@ -275,7 +275,7 @@ class HostRun:
         """Start the new process of a role; the old one leaves by itself, or is killed if it hangs."""
         host = plan.host(role)
         if files := plan.identity(role):
-            self._loop.call(self._links.by_name[host].put_files(plan.folder(host), files, BRING_S))
+            self._loop.call(self._links.by_name[host].put_files(plan.folder(host), files, COPY_S))
         until_s = time.monotonic() + LEAVE_S
         while self._supervisor.is_being_replaced(role) and time.monotonic() < until_s:
             time.sleep(LOOK_S)
@@ -494,7 +494,7 @@ class RemoteProcess:
                 on_line(line)
 
         if self._starts > 1 and self._files:
-            await self._link.put_files(self._folder, self._files, LEND_S, retry=True)
+            await self._link.put_files(self._folder, self._files, RECOPY_S, retry=True)
         settings = " ".join(f"{name}={value}" for name, value in SINGLE_THREADED.items())
         command = f"echo {PID}$$; exec env {settings} {shell_line(self._command)}"
         async with (

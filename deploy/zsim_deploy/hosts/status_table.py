@@ -79,7 +79,7 @@ class StatusTable(Screen):
             self._flies = True
             took_s = time.monotonic() - self._begun_s
             stages_s = {**self.stages_s, "processes": took_s - sum(self.stages_s.values())}
-            self.say(f"flies after {took_s:.1f} s: " + ", ".join(f"{step} {s:.1f} s" for step, s in stages_s.items()))
+            self.say(f"flying after {took_s:.1f} s: " + ", ".join(f"{step} {s:.1f} s" for step, s in stages_s.items()))
         if not self._is_live:
             super().clock(line)
 

@@ -197,7 +197,9 @@ class Wheelhouse:
             for name in names:
                 os.replace(Path(temporary, name), self._wheels / name)
         if other_versions:
-            self._progress(f"{host}: {target} gets other package versions than this machine: results are not identical")
+            self._progress(
+                f"{host}: {target} gets other package versions than this machine, so results are not identical"
+            )
         note.with_suffix(".part").write_text(json.dumps(names))
         os.replace(note.with_suffix(".part"), note)
         return names

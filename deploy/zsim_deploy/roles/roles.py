@@ -232,7 +232,7 @@ class RouterLinks:
         while self.watch.closed:
             closed = self.watch.closed.popleft()
             names = ", ".join(closed.names) or "no process of the run"
-            backlog = f"read none of {closed.held_bytes / 1e6:.1f} MB; its link is closed ({closed.times} so far)"
+            backlog = f"read none of {closed.held_bytes / 1e6:.1f} MB; its link is closed ({closed.times} times so far)"
             self._say(f"{closed.process or 'an unnamed client'} at {closed.address} ({names}) {backlog}")
 
 

@@ -31,7 +31,7 @@ class RadioChannel:
     def __init__(self, scenario: Scenario, scene: Scene) -> None:
         radio = scenario.radio_of_agents
         if radio is None:
-            raise ValueError(f"{scenario.name} has no radio")
+            raise ValueError(f"{scenario.name} has neither a radio nor a topology")
         self._radio: Radio = radio
         self._topology = Topology() if scenario.topology is UNSET else scenario.topology
         self._count = len(scenario.drones)

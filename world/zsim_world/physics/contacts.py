@@ -137,7 +137,7 @@ def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
     depth = first[VEHICLE.hull_radius] + second[VEHICLE.hull_radius] - distance
     normal = hull_force(stiffness, damping, depth, -dot(v, n))
     slip = axpy(v, -dot(v, n), n)
-    # Slip decays at the same rate as the approach, although a tangential force also turns the hulls: less inertia.
+    # Slip decays like the approach, although a tangential force meets less inertia because it also turns the hulls.
     linear_mobility = 1.0 / first[VEHICLE.mass] + 1.0 / second[VEHICLE.mass]
     angular_mobility = dot(arms[0], arms[0]) / _min_inertia(first) + dot(arms[1], arms[1]) / _min_inertia(second)
     viscous, limit = (
@@ -244,7 +244,7 @@ def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPa
 
 @inlined
 def meet_drones(bodies: Bodies) -> float:
-    """Add downwash to `air`, hull forces to `push` and their moments to `twist`; return the smallest distance [m].
+    """Add downwash to `air`, hull forces to `push`, moments to `twist`; return the smallest distance of two drones [m].
 
     Only near pairs are examined, in the order of all pairs, which gives the same bits as examining all. The near pairs
     are updated when a drone has moved by STRAY_M. `touching[i, j]` is 1 where i < j are in contact now; `touched` is

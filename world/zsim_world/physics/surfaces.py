@@ -377,7 +377,7 @@ def _follow(row: Row, sheet: Sheet, plane: NDArray, k: int, p_WB: Vector, q_WB: 
     is_new = plane[PLANE.side] == 0.0
     side = 1.0 if is_new else plane[PLANE.side]
     previous = p_WB if is_new else vector(plane, PLANE.centre_W)
-    # if farther away, it has not crossed
+    # a ball farther from the surface than this has not crossed it
     max_distance = row[VEHICLE.foot_depth] if is_new else norm(subtract(x, previous))
     if closest.distance <= max_distance and crosses(sheet, previous, x):
         side = -side

@@ -1,8 +1,8 @@
 """The participants of the lockstep, their progress, and those that the world waits for.
 
 Pure bookkeeping without session or clock: wall times are passed in. To integrate from t, the world needs the done
-message of every gating participant for t minus the command delay, or for its last period before that. The done of a
-participant that does not gate but has slack may be older by the slack.
+message of every gating participant for t minus `RunClock.ahead_ns`, or for the end of its last period before that. The
+done of a participant that does not gate but has slack may be older by the slack.
 """
 
 from collections.abc import Callable

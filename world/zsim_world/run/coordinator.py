@@ -393,7 +393,7 @@ class Coordinator(ABC):
             self.outbox.refusals.count += 1
             return
         data = {"host": join.host, "pid": join.pid, "incarnation": join.incarnation}
-        effect = "takes nobody's place" if name in self.barrier.participants else "is not waited for"
+        effect = "replaces no process" if name in self.barrier.participants else "is not waited for"
         text = f"{name} on {join.host} (pid {join.pid}) {fault}; its join {effect}"
         self.outbox.event("no_show", name, text, data)
 
@@ -483,7 +483,8 @@ class Coordinator(ABC):
     def must_wait_for(self, participant: Participant) -> bool:
         """Return whether a participant's first step may take any length of time.
 
-        It may if the process is unpaced, or if the scenario needs it and it replaced no living process."""
+        It may if the process is unpaced, or if the scenario needs it and it replaced no living process.
+        """
         if participant.served_names <= self.unpaced:
             return True
         return not participant.successor and not participant.served_names.isdisjoint(self._expected)

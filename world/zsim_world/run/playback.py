@@ -120,7 +120,7 @@ class Playback(Coordinator):
         if self._coming is None or (played.to_ns is not None and self._coming.t_ns > played.to_ns):
             until = "on" if played.to_ns is None else f"to {played.to_ns / 1e9:.12g} s"
             window = f"from {played.from_ns / 1e9:.12g} s {until}"
-            raise RecordError(f"{reader.path}: holds no gate {window}; nothing can be played")
+            raise RecordError(f"{reader.path}: contains no gate {window}; nothing can be played")
 
     def info(self) -> messages.Info:
         """Return the recorded `world/info`, adapted to the replay."""
@@ -215,7 +215,8 @@ class Playback(Coordinator):
     def _publish(self, recorded: Recorded) -> None:
         """Publish a recorded message unchanged, except that events are renumbered and kills of processes left out.
 
-        The event `end` and `view/drones` are not published: the replay has its own."""
+        The event `end` and `view/drones` are not published: the replay has its own.
+        """
         key, payload = recorded.key, recorded.payload
         if key == keys.EVENT:
             with suppress(DecodeError):
@@ -346,7 +347,7 @@ class Playback(Coordinator):
             return refused_argument(request, "to_s", f"from from_s to {VIEWED_MAX_S:g} s after it")
         count_max = max(1, VIEWED_MAX // len(self.names))
         if every_s is None or not every_s > 0.0 or (to_s - from_s) / every_s >= count_max:
-            return refused_argument(request, "every_s", f"above 0, for {count_max} instants of this run at most")
+            return refused_argument(request, "every_s", f"above 0, with at most {count_max} instants in total")
         instants = [round((from_s + k * every_s) * 1e9) for k in range(int((to_s - from_s) / every_s) + 1)]
         last: dict[str, bytes] = {}
         views: list[tuple[str, bytes]] = []

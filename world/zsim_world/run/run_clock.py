@@ -106,7 +106,7 @@ class RunClock:
         if gates is None or not 1 <= gates <= GATES_MAX or gates != int(gates):
             return refused_argument(request, "gates", f"a whole number from 1 to {GATES_MAX}")
         if self.state != required_state:
-            return Refusal("the run", self.state, f"{op} needs a {required_state} one")
+            return Refusal("the run", self.state, f"must be {required_state} for {op}")
         if op == "pause":
             self.hold()
         elif op == "resume":

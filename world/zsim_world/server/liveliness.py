@@ -205,13 +205,13 @@ class SlowReaders:
             clause = f", which reads {', '.join(reads[:SHOWN])}{ellipsis}," if reads else ""
             reader = f"{closed.process or 'somebody'} at {closed.address} on {host}"
             size = f"{closed.held_bytes / 1e6:.1f} MB"
-            text = f"{reader} ({names}){clause} took nothing of {size}; its link is closed ({closed.times} so far)"
+            text = f"{reader} ({names}){clause} read none of {size}; its link is closed ({closed.times} times so far)"
             self._run.call("reader_closed", text, {**closed._asdict(), "host": host, "reads": reads})
 
     def stuck(self) -> str:
         """Return a text that names the blocked link."""
         names = self.watch.stuck()
-        return f"the link to {names[0]} takes no data" if names else "no link is known to be full"
+        return f"the link to {names[0]} accepts no data" if names else "no link is known to be full"
 
 
 @dataclass

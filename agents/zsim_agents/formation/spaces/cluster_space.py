@@ -227,7 +227,7 @@ def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Arr
 
 @portable
 def put_wrapped(c: Array, period: Array, out: Array) -> None:
-    """Write c with each variable wrapped to half a period about zero; a period of 0 means no wrapping."""
+    """Write c with each variable wrapped to within half a period of zero; a period of 0 means no wrapping."""
     for k in range(c.size):
         out[k] = c[k] - period[k] * np.rint(c[k] / TAU)
 

@@ -1,8 +1,8 @@
 """The cluster space of a scenario's cluster: a stock one, a user's class, or a cluster of clusters if it has groups.
 
 Group k has cluster variables c_k of its own robots. Its (x_c, y_c, z_c, yaw) are the position and heading of robot k of
-the parent; the rest of c_k (tilts, headings and shape) is added to the parent's variables. For m groups, 4m variables
-of the parent and 4n_k - 4 of each group add up to 4n. Groups may themselves be clusters of clusters.
+the parent; the rest of c_k (tilts, headings and shape) is appended to the parent's variables. For m groups, the 4m
+variables of the parent and 4n_k - 4 of each group add up to 4n. Groups may themselves be clusters of clusters.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ from zsim_agents.formation.spaces.cluster_space import (
     row,
 )
 
-INDEPENDENT_MIN = 1e-6  # minimum share of a direction outside the previous ones; rounding leaves 1e-15
+INDEPENDENT_MIN = 1e-6  # minimum share of a direction outside the span of the previous ones; rounding leaves 1e-15
 PLANES = ((0, 1), (0, 2), (1, 2))
 NO_FRAME = "the robots are collinear or coincide, or are too far from the template: the formation has no frame"
 HEADING, TURN, BEND = 6, slice(0, 3), slice(3, 6)  # indices in the 7 x 7 matrix of `condition`

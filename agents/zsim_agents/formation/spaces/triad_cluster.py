@@ -183,7 +183,7 @@ def put_shape_rates(J_inv: Array, c: Array, R_WC: Matrix) -> None:
 
 @portable
 def add_rate(J_inv: Array, robot: int, column: int, rate_W: Vector) -> None:
-    """Add the motion of one robot per unit of a variable; all move back by the mean, so that the centroid stays."""
+    """Add the motion of one robot per unit of a variable; all move back by the mean, so that the centroid stays put."""
     n = J_inv.shape[0] // 4
     for k in range(3):
         mean_rate = rate_W[k] / n
@@ -317,7 +317,7 @@ def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:
     horizontal, rho = el.hypot(x, y), el.hypot(x, y, z)
     if not horizontal > LENGTH_MIN_M:
         raise SingularClusterError(f"robot {k + 1} is on the z axis through robot 1: it has no azimuth")
-    rates_C = np.array(spherical_rates(*spherical((x, y, z))))  # orthogonal rows of lengths 1, flat and rho
+    rates_C = np.array(spherical_rates(*spherical((x, y, z))))  # orthogonal rows of lengths 1, horizontal and rho
     gradient = rates_C / np.array([(1.0,), (horizontal * horizontal,), (rho * rho,)])
     motion_C = linear.product([(0, -z, y), (z, 0, -x), (-y, x, 0)], rate.reshape(3, -1)).reshape(rate.shape)
     motion_C[:, k] += R_WC.T

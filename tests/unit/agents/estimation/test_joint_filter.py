@@ -120,6 +120,24 @@ def test_sightings_by_two_detectors_in_one_picture_count_once(slower_first: bool
     assert estimates[1].sensors["sightings"][0] > 100
 
 
+def test_a_hat_counts_once_in_each_of_two_simultaneous_pictures():
+    """The observer's two cameras are at the same place, and each picture contains the hat twice."""
+    mount = EYES.drones[1].sensors.cameras()["front"].mount
+    bottom = msgspec.structs.replace(EYES.drones[1].sensors.cameras()["bottom"], mount=mount)
+    sensors = msgspec.structs.replace(EYES.drones[1].sensors, bottom_camera=bottom)
+    drones = [EYES.drones[0], msgspec.structs.replace(EYES.drones[1], sensors=sensors), EYES.drones[2]]
+    bank, rng = JointBank(drones, EYES.environment, EYES.estimation, GATE_S), np.random.default_rng(3)
+    used = []
+    for gate in range(300):
+        still(bank, gate, rng)
+        message = sighted(1, PLACES[0], gate * GATE_NS)
+        for camera in ("front", "bottom"):
+            twice = msgspec.structs.replace(message, camera=camera, seen=message.seen * 2)
+            bank.receive(1, "sightings", twice, gate * GATE_S)
+        used.append(bank.estimate(gate * GATE_S)[1].sensors["sightings"][0])
+    assert set(np.diff(used).tolist()) == {0, 2}  # none while the hat could be another drone's
+
+
 def test_sightings_of_an_unknown_camera_have_no_effect():
     bank, calm = (bank_of() for _ in range(2))
     rngs = np.random.default_rng(3), np.random.default_rng(3)

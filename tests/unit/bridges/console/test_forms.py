@@ -415,7 +415,7 @@ def test_a_common_fault_has_the_labelled_target_and_magnitude(
     struck = "drones" if target == "world" else target.rpartition("/")[2]
     assert has_terms(told, label, struck)
     assert has_terms(
-        told, "Messages lost", "processes", "world", "no radio"
+        told, "Messages lost", "processes", "world", "not by radio"
     )  # a link between processes is not a radio link
     assert magnitude is None or has_terms(told, label, f"{magnitude[1]:g}")
 

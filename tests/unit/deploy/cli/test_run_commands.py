@@ -19,7 +19,7 @@ from zsim_deploy.launch.supervisor import Outcome
 
 INTERRUPTED = Outcome("interrupted by Ctrl-C", interrupted=True)
 DIED = Outcome("the world died", failed=True)
-NO_MESSAGE = RecordError("run.mcap: holds no message")
+NO_MESSAGE = RecordError("run.mcap: contains no messages")
 
 
 @pytest.fixture(autouse=True)

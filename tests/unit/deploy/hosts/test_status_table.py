@@ -94,10 +94,10 @@ def test_a_host_that_always_answers_late_is_not_silent(board):
 def test_the_start_is_reported_with_the_duration_of_its_stages(board):
     board.stages_s = {"connect": 0.25, "check": 0.5}
     board.clock(clock(0.0, state="waiting"))
-    assert "flies after" not in printed(board)
+    assert "flying after" not in printed(board)
     board.clock(clock(1.2))
     board.clock(clock(2.4))
-    assert printed(board).count("flies after") == 1
+    assert printed(board).count("flying after") == 1
     assert has_terms(printed(board), "connect 0.2 s", "check 0.5 s", "processes")
 
 

@@ -1,6 +1,6 @@
 """Liveliness: dead, silent and slow processes, and which joins are admitted.
 
-A forged join, with no process behind it, takes nobody's place and holds up the run only briefly.
+A forged join, with no process behind it, replaces no process and holds up the run only briefly.
 """
 
 from collections.abc import Callable
