@@ -229,7 +229,7 @@ def test_plans_that_differ_only_in_more_runs_are_the_same_sweep() -> None:
         ({"runs": 2}, "4 runs", "2"),
         ({"vary": ("seed",)}, "seed wind.gust_m_s=0,1", "seed"),
         ({"vary": ("seed", f"{GUST}=0,2")}, "wind.gust_m_s=0,1", f"{GUST}=0,2"),
-        ({"document": other}, "another", "duration_s"),
+        ({"document": other}, "different", "duration_s"),
         ({"records": True}, "records"),
         ({"version": "9"}, "9"),
     ):

@@ -127,7 +127,7 @@ def test_a_missing_listener_raises_a_distinct_error() -> None:
 @pytest.mark.parametrize(
     ("endpoint", "terms"),
     [
-        ("tcp/192.0.2.1:7447", ("no address of this machine", "--listen")),
+        ("tcp/192.0.2.1:7447", ("not an address of this machine", "--listen")),
         ("tcp/no-such-host.invalid:7447", ("the name is not known", "--listen")),
         ("tcp/127.0.0.1:99999", ("from 1 to 65535", "--listen")),
         ("tcp/127.0.0.1:7447#iface=no-such", ("no such network interface",)),
