@@ -36,7 +36,7 @@ JOIN_S = 1.0  # wall time after which a join is repeated if no event confirms it
 LEAD_MAX_NS = 4_000_000_000  # maximum lead of the world over the record on disk; the world's history covers 5 s
 DRAIN_S = 1.0  # time to wait for the byes of other processes after the clock has stopped
 STOP_DRAIN_S = 0.5  # time to wait for the end of the run after a requested stop, as the world may be stopped, too
-QUIET_S = 1.5  # time without a clock after which one was missed: even a paused world sends one per second
+QUIET_S = 1.5  # time without a clock after which one must have been missed: even a paused world sends one per second
 
 REPLAY_S = 5.0  # timeout of queries, which a hub answers within milliseconds
 FLUSH_NS = 1_000_000_000  # simulated time between writes to disk
@@ -240,7 +240,7 @@ class Recorder:
                 held.clear()
 
     def _fetch_missed(self, before: Clock | None = None) -> None:
-        """Write the messages that the world still has since the newest one in the record, up to a clock if given."""
+        """Write the messages after the newest one in the record that the world still has, up to a clock if given."""
         self._writer.flush()
         self._known.add_tail(self._writer.path)
         self._catch_up(before)
@@ -285,7 +285,7 @@ class Recorder:
         return False
 
     def _write_arrived(self, arrived: Iterable[Passed]) -> None:
-        """Write received messages and, before them, those from the world's history that a gap in the clocks reveals.
+        """Write received messages and, before them, if the clocks have a gap, those from the world's history.
 
         Messages are held until the next clock is checked, since they may be later than missing ones. After a lost link
         in realtime, in which the world does not wait for this process, the missed messages need not include a clock;

@@ -22,7 +22,7 @@ NAMED_MAX = 3  # maximum number of collisions listed in a failure
 
 
 class Assertions(ABC):
-    """Assertions about a run; each of them first lets the run fly to its end."""
+    """Assertions about a run; each of them first lets the run finish."""
 
     @abstractmethod
     def run(self) -> "Run":
@@ -31,7 +31,7 @@ class Assertions(ABC):
     def assert_errors(
         self, window: tuple[float, float] | None = None, cluster: str | None = None, **rms: float
     ) -> None:
-        """Assert the true errors of a formation: the RMS of truth − desired while it is engaged.
+        """Assert bounds on the true errors of a formation: the RMS of truth − desired while it is engaged.
 
         Args:
             window: start and end [s]; None: that of the report.
@@ -39,8 +39,8 @@ class Assertions(ABC):
             rms: largest allowed RMS of each cluster variable [m, rad], such as p=0.3.
 
         Raises:
-            AssertionError: an RMS is larger (one line for each, with the largest error and its time) or unknown, the
-                run ended before the window did, or the formation was not engaged throughout the window.
+            AssertionError: an RMS exceeds its bound (one line for each, with the largest error and its time) or is
+                unknown, the run ended before the window did, or the formation was not engaged throughout the window.
             RunError: the formation has no such variable.
         """
         __tracebackhide__ = True  # pytest then shows the line of the test, not this function
@@ -49,12 +49,14 @@ class Assertions(ABC):
         window = window or run.summary.window_s
         where = f"{formation.name} from {window[0]:g} to {window[1]:g} s"
         if unknown := [name for name in rms if name not in formation.names]:
-            raise RunError(f"{where}: has no variable {unknown[0]!r}; must be one of {', '.join(formation.names)}")
+            raise RunError(
+                f"{formation.name} has no variable {unknown[0]!r}; must be one of {', '.join(formation.names)}"
+            )
         share, errors_by_name, faults = formation.engaged_share(window), formation.errors(window), []
         if window[1] > run.duration_s:
             faults.append(f"{where}: the run ended at {run.duration_s:g} s")
         elif share != 1.0:
-            faults.append(f"{where}: was engaged for {share or 0:.0%} of the time; must be for all of it")
+            faults.append(f"{where}: the formation was engaged for {share or 0:.0%} of the time; must be all of it")
         for name, allowed in rms.items():
             error = errors_by_name[name].true_rms
             if error is None:

@@ -20,15 +20,15 @@ from zsim.transport.zenoh_settings import Mode, Settings
 
 ATTEMPT_S = 1.0  # limit of one attempt to connect, so that waiting can be reported and interrupted
 PAUSE_S = 0.1  # between queries to a hub while no world answers; it may be starting, or be in another federation
-ANSWER_S = 1.0  # time limit of an answer; a hub answers within milliseconds, unless it is still compiling
+ANSWER_S = 1.0  # time limit for an answer; a hub answers within milliseconds, unless it is still compiling
 _OS_ERROR = re.compile(r"(?:os error |code: )(\d+)")
-_OTHER = "give another with --listen, and with --connect to the other commands"
+_OTHER = "choose another address with --listen, and pass it to the other commands with --connect"
 _LISTEN_FAULTS = {  # by errno
     errno.EADDRINUSE: f"another process listens there; {_OTHER}",
     errno.EADDRNOTAVAIL: f"that is not an address of this machine (`ip address` lists them); {_OTHER}",
     errno.EACCES: f"this user may not open it; ports below 1024 need root; {_OTHER}",
     errno.EPERM: f"this process may not open it; {_OTHER}",
-    errno.EINVAL: f"the address lacks its network interface, as in tcp/[fe80::1%eth0]:7447; {_OTHER}",
+    errno.EINVAL: f"the address lacks its network interface; give it as in tcp/[fe80::1%eth0]:7447; {_OTHER}",
     errno.ENODEV: "this machine has no such network interface; `ip address` lists them",
     errno.EMFILE: "this process has too many files open; allow more with `ulimit -n`",
     errno.ENFILE: "this machine has too many files open; end other programs, or raise fs.file-max",
@@ -45,7 +45,7 @@ _LISTEN_TEXTS = {  # parts of Zenoh's errors without an errno
 def listen(
     endpoints: Sequence[str], federation: str, mode: Mode, identity: Identity | None = None
 ) -> Iterator[Session]:
-    """Open the hub: a listening router, of which every other role is a client.
+    """Open the hub: a listening router, to which clients and other routers connect.
 
     A peer would suffice for clients, but does not forward between routers connected to it.
 
@@ -74,7 +74,7 @@ def connect(
     federation: str,
     mode: Mode = "lockstep",  # mode of the run, if known
     wait_s: float | None = None,  # how long to keep trying; None: 0.5 s
-    # whether the run never waits for it: even in lockstep, a silence of LEASE_READER_MS is then taken as its death
+    # whether the run never waits for this client; it is then taken as dead after LEASE_READER_MS, even in lockstep
     reader: bool = False,
     identity: Identity | None = None,  # host and certificate; by default this host's name and no TLS
 ) -> Iterator[Session]:
@@ -143,7 +143,7 @@ def find_world(
     """Yield a session and the `world/info` of its run.
 
     Raises:
-        NoWorldError: no world answered within `wait_s`, its answer is unusable, or `stopped` returned true.
+        NoWorldError: no world answered within `wait_s`, an answer is unusable, or `stopped` returned true.
         SessionError: waiting would not help: the endpoint is malformed, or a certificate is refused or not admitted.
         BadNameError: the contract does not allow the federation's name.
     """
@@ -187,13 +187,15 @@ def find_world(
 
 
 def _no_answer(link: Session, identity: Identity | None) -> str:
-    """Return why a hub that accepts connections may not answer; hubs of other versions or federations never do."""
-    may_be = ", but a process listens there: another federation, a starting world, or a router without a world"
+    """Return why a hub that accepts connections might not answer; hubs of other versions or federations never do."""
+    may_be = (
+        ", but a process listens there: of another federation, a world that is starting, or a router without a world"
+    )
     if identity is None or identity.tls is None or link.permissions is not None:
         return f"{may_be}; correct --federation, or wait longer"
     return (
-        f"{may_be}, or we are refused or not allowed here; correct --federation, wait longer, "
-        "or admit us with `zsim certs init --operator` and start the world again"
+        f"{may_be}, or it refuses this process or does not admit it; correct --federation, wait longer, "
+        "or admit this process with `zsim certs init --operator NAME` and restart the world"
     )
 
 
@@ -208,7 +210,9 @@ def _no_link(endpoint: str) -> str:
         socket.create_connection((host.strip("[]"), int(port)), ANSWER_S).close()
     except (OSError, OverflowError, ValueError):
         return hint
-    return ", but the process that listens there refuses us; for a world with TLS, use tls/ and --tls FOLDER"
+    return (
+        ", but the process that listens there refused the connection; for a world with TLS, use tls/ and --tls FOLDER"
+    )
 
 
 def read_permissions(link: Session) -> Permissions | None:
@@ -235,5 +239,5 @@ def read_info(link: Session) -> messages.Info | None:
         try:
             return messages.decode(keys.INFO, sample.payload)
         except DecodeError as error:
-            raise NoWorldError(f"{error}; is the world of another version?") from error
+            raise NoWorldError(f"{error}; does the world run another version of zsim?") from error
     return None

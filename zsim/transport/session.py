@@ -75,7 +75,7 @@ def _key_errors(expression: str) -> Iterator[None]:
     except zenoh.ZError as error:
         stripped = re.sub("//+", "/", expression.strip("/"))
         allowed = "must be names with / between them, * for any name, ** for any number of them"
-        instead = f"must be {stripped}, without / at its ends" if stripped not in (expression, "") else allowed
+        instead = f"must be {stripped}" if stripped not in (expression, "") else allowed
         raise SessionError(f"key is {expression!r} ({_first_sentence(error).split('`: ')[-1]}); {instead}") from error
 
 
@@ -115,7 +115,7 @@ class Subscription:
         try:
             return self._take(self._handler.recv())
         except zenoh.ZError as error:
-            raise SessionError(f"{self.expression}: is closed") from error
+            raise SessionError(f"the subscription to {self.expression} is closed") from error
 
     def drain(self) -> Iterator[ReceivedSample]:
         """Yield received messages without waiting."""
@@ -230,7 +230,7 @@ class Session:
         return str(self._raw.info.zid())
 
     def undeclare_all(self) -> None:
-        """Undeclare everything: declarations left when a Zenoh session closes leak files and memory."""
+        """Undeclare everything: declarations left when a Zenoh session closes leak file descriptors and memory."""
         for undeclare in list(self._declared.values()):
             with suppress(zenoh.ZError):  # already undeclared, or its session is closed
                 undeclare()
@@ -393,7 +393,7 @@ class Session:
     def query(
         self, expression: str, parameters: str = "", payload: bytes = b"", encoding: str = "", timeout_s: float = 2.0
     ) -> list[RawSample]:
-        """Return all replies to a query, refusals included; SessionError if it is not a key expression."""
+        """Return all replies to a query, refusals included; SessionError if `expression` is not a key expression."""
         body: dict[str, Any] = {"payload": payload, "encoding": zenoh.Encoding(encoding)} if payload else {}
         with _key_errors(expression):
             selector = zenoh.Selector(self._prefix + expression, parameters)
@@ -430,7 +430,7 @@ class Session:
         try:
             payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
         except (OverflowError, UnicodeEncodeError) as error:
-            allowed = "must be 64-bit integers and UTF-8 text"
+            allowed = "integers must fit into 64 bits, and text must be valid UTF-8"
             raise SessionError(f"{key}: {op} cannot be sent ({error}); {allowed}") from error
         if fault := self._refusal("ask", key):
             return Unanswered(ok=False, error=fault)
@@ -440,7 +440,7 @@ class Session:
                 return messages.decode_as(ControlAnswer, reply.payload, key)
         is_timeout = time.monotonic() - start_s >= timeout_s
         cause = f"no answer came within {timeout_s:g} s" if is_timeout else "no process answers there"
-        return Unanswered(ok=False, error=f"{key}: {cause}; is it running?")
+        return Unanswered(ok=False, error=f"{key}: {cause}; is the process that serves it running?")
 
     def declare_queryable(self, expression: str, callback: Callable[[Query], None], complete: bool = False) -> None:
         """Call back for every query, on a Zenoh thread; `complete` means that no other process needs to be queried."""

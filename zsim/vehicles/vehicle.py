@@ -26,11 +26,13 @@ from zsim.schema.quantities import Fraction, NonNegative, Positive, Real
 ROTORS_MIN, ROTORS_MAX = 4, 8  # fewer cannot hold a heading in a hover; more do not fit into a message
 ARM_MISS_MAX = 0.01  # maximum mismatch relative to the arm; design choice: rounding in a drawing
 BALANCE_MAX = 1e-6  # maximum mean moment of the rotors at equal speeds, in the units of `allocation`
-LIFT_MIN = 0.2  # minimum ratio of a rotor's hover thrust to the mean; design choice: with less it cannot help control
+LIFT_MIN = (
+    0.2  # minimum ratio of a rotor's hover thrust to the mean; design choice: with less, it hardly adds to control
+)
 RANK_MIN = 1e-3  # minimum ratio of the weakest combination of thrust, roll, pitch and yaw to the strongest
 
 DEFAULT_MODEL, MODELS = "ardrone2", ("ardrone2", "crazyflie2")  # each is a module of this package
-ALLOWED = f"{', '.join(MODELS)}, or package.module of your own that defines VEHICLE"
+ALLOWED = f"{', '.join(MODELS)}, or a package.module of your own that defines VEHICLE"
 
 Mass = Annotated[float, Meta(gt=0, le=100)]
 Arm = Annotated[float, Meta(gt=0, le=10)]
@@ -185,7 +187,9 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         farthest = max(el.hypot(rotor.x_m, rotor.y_m) for rotor in self.rotors)
         if not math.isclose(self.arm_m, farthest, rel_tol=ARM_MISS_MAX):
             fault = f"arm_m is {self.arm_m:g}, but the farthest of the rotors is {farthest:.4g} m from the centre"
-            raise ValueError(f"{fault}; must be the same: give both, and airframe and rotor_radius_m that fit")
+            raise ValueError(
+                f"{fault}; must be the same: give both arm_m and rotors, and a fitting airframe and rotor_radius_m"
+            )
         strengths = linear.singular_values(np.vstack([np.ones(count), allocation(self)]))
         if strengths[-1] < RANK_MIN * strengths[0]:
             raise ValueError(
@@ -193,8 +197,10 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             )
         shares = lift_shares(self)
         if shares.min() < LIFT_MIN:
-            weakest = f"rotors: {names[int(shares.argmin())]} bears {shares.min():.2f} of the mean thrust in a hover"
-            raise ValueError(f"{weakest}; must be >= {LIFT_MIN:g}: place them about the centre of mass, turns balanced")
+            weakest = f"rotors: {names[int(shares.argmin())]} gives {shares.min():.2f} of the mean thrust in a hover"
+            raise ValueError(
+                f"{weakest}; must be >= {LIFT_MIN:g}: place the rotors about the centre of mass, with balanced turns"
+            )
 
 
 @cache
@@ -237,7 +243,7 @@ def cross_layout(arm_m: float) -> tuple[Rotor, ...]:
 
 
 def allocation(vehicle: Vehicle) -> np.ndarray:
-    """Return the roll, pitch and yaw moments per thrust of each rotor, (3, R).
+    """Return the roll, pitch and yaw moments per unit thrust of each rotor, (3, R).
 
     Roll and pitch are in units of arm_m / sqrt(2), yaw in units of the torque per thrust.
     """

@@ -69,7 +69,7 @@ class Renderer:
     def __init__(
         self, camera: Camera, scene: Scene, carrier: int, seed: int, name: str, ground: Ground | None = None
     ) -> None:
-        gain = 1.0 / math.sqrt(scene.light)  # compensates, in stops, for half of the light missing from a clear day
+        gain = 1.0 / math.sqrt(scene.light)  # compensates, in stops, for half of the light that is missing
         self._camera, self._scene, self._carrier = camera, scene, carrier
         self._exposure_s = camera.exposure_ms * 1e-3
         self._pose = camera_pose(camera)
@@ -202,7 +202,7 @@ class Level(NamedTuple):
 
 
 class Ground:
-    """A ground in levels of decreasing resolution.
+    """The ground, as levels of decreasing resolution.
 
     Args:
         tile: square of greys up to 150, centred on W's origin, north up; its side is a multiple of 100 texels.

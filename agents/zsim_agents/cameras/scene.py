@@ -39,7 +39,7 @@ SHIFT = 4  # fractional bits of coordinates for OpenCV: sixteenths of a pixel
 
 
 class DroneLook(NamedTuple):
-    """Look of a drone: rotor hubs (R, 2) [m; B], directions of rotation (R,), rotor radius, whether it has a hat."""
+    """Appearance of a drone: rotor hubs (R, 2) [m; B], directions of rotation (R,), rotor radius, and any hat."""
 
     hubs_B: Array
     turns: Array
@@ -133,7 +133,7 @@ class View:
 
     Attributes:
         plane: intersections of the pixels' rays with the plane z = 1 of K, (height, width, 2).
-        rays: unit vectors of K through the centres of the pixels, (height, width, 3).
+        rays: unit vectors in K through the centres of the pixels, (height, width, 3).
     """
 
     def __init__(self, lens: Lens) -> None:
@@ -174,7 +174,7 @@ def has_pixels(box: list[int]) -> bool:
 
 
 def motion_blur_kernels(displacements_px: Array) -> list[Kernel]:
-    """Return the blur kernels of motions in an exposure, (N, 2) [px]: the share of the time spent in each pixel."""
+    """Return the blur kernels of motions during an exposure, (N, 2) [px]: the share of the time spent in each pixel."""
     lengths = np.hypot(*displacements_px.T)
     clipped = displacements_px * np.minimum(1.0, BLUR_MAX_PX / np.maximum(lengths, 1e-9))[:, None]
     count = max(2, math.ceil(min(lengths.max(), BLUR_MAX_PX) * SAMPLES_PER_PX))

@@ -168,9 +168,9 @@ def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> St
             )
         fault = ""
         if field in ("covariance", "yaw_sigma_rad") and (smallest := min(numbers[:: STATES + 1])) < 0.0:
-            fault = f"the {'variance' if field == 'covariance' else 'value'} {smallest:g}; must be >= 0"
+            fault = f"{'variance' if field == 'covariance' else 'value'} {smallest:g}; must be >= 0"
         elif field == "orientation_wxyz" and abs((norm := el.length(numbers)) - 1.0) > NORM_TOLERANCE:
-            fault = f"the norm {norm:g}; must be 1"
+            fault = f"norm {norm:g}; must be 1"
         if fault:
             raise UserCodeError(f"{context} {field} with {fault}")
         values[field] = tuple(numbers)

@@ -1,9 +1,9 @@
 """The nominal state of a drone: propagated by every IMU sample, corrected by the filter, and kept in a history.
 
 A late reading measures a past state, free of the process noise since then. Where that matters, the error state contains
-clones of past positions and velocities: the reading is compared with the clone nearest in time, whose correlations
-correct the present state. S. I. Roumeliotis, J. W. Burdick, "Stochastic cloning: a generalized framework for processing
-relative state measurements", IEEE International Conference on Robotics and Automation, 2002.
+clones of past positions and velocities: the reading is compared with the clone nearest in time, whose correlations with
+the present state correct that state, too. S. I. Roumeliotis, J. W. Burdick, "Stochastic cloning: a generalized
+framework for processing relative state measurements", IEEE Int. Conf. on Robotics and Automation, 2002.
 
 The functions from `reckon` on perform dead reckoning: Madgwick's attitude filter, strapdown integration, and growth of
 small errors. S. O. H. Madgwick, "An efficient orientation filter for inertial and inertial/magnetic sensor arrays",
@@ -187,7 +187,7 @@ def grow(rows: Rows, i: int, P: Array) -> Array:
 
 @inlined
 def write_growth(rows: Rows, i: int, F: Array, Q: Array) -> None:
-    """Write the growth of the errors over the interval that ends now: transition into F, I on entry, and noise into Q.
+    """Write the growth of the errors over the interval that ends now: the transition into F, the noise into Q.
 
     Biases that are Gauss-Markov processes decay.
     """
@@ -248,7 +248,9 @@ def clone(rows: Rows, i: int, J: Array, first: int) -> None:
     if not layout[LAYOUT.clones] or not rows.counts[i, COUNT.heading_known]:
         return
     every_s = rows.setting[i, SETTING.clone_every]
-    count = math.floor(row[NOMINAL.t] / every_s + 1e-6)  # clones are due at multiples of every_s, as samples are
+    count = math.floor(
+        row[NOMINAL.t] / every_s + 1e-6
+    )  # clones are due at multiples of every_s, as samples are of their periods
     slot = count % layout[LAYOUT.clones]
     former = rows.clones[i, slot]
     if former[CLONE.t] / every_s + 1e-6 >= count:  # also false for an unused clone, whose time is NaN
@@ -278,8 +280,8 @@ def recall_known(rows: Rows, i: int, t_s: float, now: Moment) -> tuple[Moment, f
     """Return the state at `t_s` as known now, and the errors that it shares.
 
     Returns:
-        The state; how much earlier it is than the position and velocity whose errors it shares [s]; the index of these
-        in the error state: 0 for the present position and velocity, otherwise those of a clone.
+        The state; how much earlier it is than the position and velocity whose errors it shares [s]; the index of those
+        errors in the error state: 0 for the present position and velocity, otherwise a clone's.
     """
     past = recall(rows.counts[i], rows.history[i], rows.layout[i, LAYOUT.history], t_s, now)
     nearest, slot = abs(now[0] - t_s), -1
@@ -373,7 +375,7 @@ def reckon(
     gravity: float,
     dt: float,
 ) -> Reckoning:
-    """Return the state after one IMU sample: Madgwick's step, then velocity and position by trapezoids.
+    """Return the state after one IMU sample: Madgwick's step, then velocity and position by the trapezoidal rule.
 
     Args:
         state: state at the previous sample.
@@ -425,7 +427,7 @@ def madgwick_step(q: Quaternion, w_WB_B: Vector, f_B: Vector, beta: float, dt: f
 
 @inlined
 def gravity_gradient(q: Quaternion, f_B: Vector) -> Quaternion:
-    """Return J^T f, the gradient of |R_BW z_W - f_B/|f_B||^2 / 2 over q [Madgwick (25), (26), (34)]."""
+    """Return J^T f, the gradient of |R_BW z_W - f_B/|f_B||^2 / 2 with respect to q [Madgwick (25), (26), (34)]."""
     w, x, y, z = q
     scale = 1.0 / norm(f_B)
     ex = 2.0 * (x * z - w * y) - f_B[0] * scale
@@ -441,7 +443,7 @@ def gravity_gradient(q: Quaternion, f_B: Vector) -> Quaternion:
 
 @inlined
 def rotation_vector_quaternion(v: Vector) -> Quaternion:
-    """Return the quaternion of a rotation vector [rad], by series: exact to 1e-9 up to 0.6 rad, without libm.
+    """Return the quaternion of a rotation vector [rad], by a series accurate to 1e-9 up to 0.6 rad, without libm.
 
     Gyroscope steps and filter corrections are far below that; the result is always normalised.
     """
@@ -455,7 +457,7 @@ def levelling_time_s(beta: float, direction_sigma_rad: float) -> float:
     """Return the time constant with which Madgwick's filter follows the measured tilt [s]; infinite for beta = 0.
 
     The filter's step has a fixed length 2 beta dt. With noise sigma of the measured direction per axis [rad], its mean
-    along a small offset e is 2 beta dt * sqrt(pi/8) * e/sigma, hence a first-order pull.
+    along a small offset e is 2 beta dt * sqrt(pi/8) * e/sigma, so the tilt error decays as a first-order lag.
     """
     if beta == 0.0:
         return math.inf
@@ -499,7 +501,7 @@ def write_prediction(
     variances: Vector,
     dt: float,
 ) -> None:
-    """Write transition and process noise of dead reckoning from the velocity `v_before` [m/s] to `state`."""
+    """Write the transition and the process noise of dead reckoning from the velocity `v_before` [m/s] to `state`."""
     v = state[1]
     f_W = (
         (v[0] - v_before[0]) / dt,
@@ -516,7 +518,7 @@ def write_transition(F: Array, f_W: Vector, R_WB: Matrix, levelling_s: float, ha
 
     p' = v; v' = -[f_W]x theta - R b_a; theta' = -R b_g - (theta_x, theta_y, 0)/levelling_s.
 
-    f_W is the mean specific force [m/s^2], levelling_s the time constant of Madgwick's pull [s], possibly infinite.
+    f_W is the mean specific force [m/s^2], levelling_s the time constant of levelling [s], possibly infinite.
     """
     for i in range(3):
         F[POSITION + i, VELOCITY + i] = dt

@@ -2,9 +2,9 @@
 
 CAPT (concurrent assignment and planning of trajectories): Turpin, Michael and Kumar, Int. J. Robotics Research 33
 (2014) 98-112. All fly straight from start to goal with a common function of time u, p_i = s_i + u (g_i - s_i). The
-assignment with the minimum sum of squared distances has (s_i - s_j).(g_i - g_j) >= 0 for every pair; with starts a and
-goals b apart, no pair then comes closer than a b / sqrt(a^2 + b^2), which is at least min(a, b) / sqrt 2. The minimum
-sum of distances gives no such bound.
+assignment with the minimum sum of squared distances has (s_i - s_j).(g_i - g_j) >= 0 for every pair; with starts at
+least a apart and goals at least b apart, no pair then comes closer than a b / sqrt(a^2 + b^2), which is at least
+min(a, b) / sqrt 2. The minimum sum of distances gives no such bound.
 
 The common time stops while a robot is far from its reference position.
 """
@@ -28,7 +28,7 @@ from zsim_agents.formation.trajectory import named_values, variable_of
 PEAK_RATE = 1.875  # peak rate of the minimum-jerk function of time over its mean rate
 DURATION_MIN_S = 2.0  # minimum duration, as for a ramp of the reference
 LAG_M = 0.7  # distance of a robot from its reference above which all wait; design choice: 1/3 of the minimum separation
-ARRIVAL_TOLERANCE_M = 0.5  # maximum distance from the goal on arrival; design choice: two sigma of an estimated side
+ARRIVAL_TOLERANCE_M = 0.5  # maximum distance from the goal on arrival; design choice: two sigma of a side's estimate
 POSE_NAMES = ("x_c", "y_c", "z_c", "yaw")  # variables that are defined for robots in any arrangement
 
 
@@ -50,7 +50,7 @@ class Assembly:
             self._elapsed_s = min(self._elapsed_s + dt_s, self.over_s)
 
     def velocities(self, p_W: Array) -> Array:
-        """Return the velocities (n, 3) [m/s, W] of robots at p_W (n, 3) [m], not yet guarded."""
+        """Return the velocities (n, 3) [m/s, W] of robots at p_W (n, 3) [m], before `guard` limits them."""
         position_W, rate_W = self._reference()
         v_W = rate_W + self._gains.k_1_s * (position_W - p_W)
         speed = np.sqrt(v_W[:, 0] ** 2 + v_W[:, 1] ** 2)
@@ -131,7 +131,7 @@ def planned_assembly(
     start_W = p_W[order]
     min_m, distance = separation_share * gains.separation_min_m, straight_separation(start_W, goal_W)
     if distance < min_m - ROUNDING_M:
-        finding = f"on the paths to their positions two drones come within {distance:.2f} m"
+        finding = f"on the paths to their positions two drones come within {distance:.2f} m of each other"
         remedy = f"guaranteed if starts and goals are each {math.sqrt(2.0) * gains.separation_min_m:.2f} m apart"
         raise RefusalError(f"{finding}; allowed: {min_m:g} m or more, {remedy}")
     return Assembly(start_W, goal_W, c, _min_duration_s(start_W, goal_W, gains), gains), order

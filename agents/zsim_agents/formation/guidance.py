@@ -29,8 +29,8 @@ RAMP_MIN_S, RAMP_MAX_S = 2.0, 3600.0
 RAMP_GROWTH = 1.2  # minimum growth factor in the search for a ramp that is slow enough
 RAMP_SAMPLES = 33  # odd, so that one falls on the middle of a ramp, where its rate peaks
 LOAD_TOLERANCE = 1.02  # factor on the allowed share of the speed limits: ramps are sampled, and may start at the limit
-# Horizontal distance from its position within which a robot climbs or descends, and distance at which it has rejoined;
-# design choice: half of the minimum separation
+# Horizontal distance from its assigned position within which a robot climbs or descends, and distance at which it has
+# rejoined; design choice: half of the minimum separation
 VERTICAL_WITHIN_M = 1.0
 REJOINED_M = 1.0
 
@@ -212,8 +212,8 @@ class AssignedPositions:
     """The assigned positions p_W (n, 3) [m] in a held formation, and the motion of each robot to its own.
 
     A robot far from its position (for example after landing and taking off again) distorts the shape so much that the
-    robots cannot be led as a formation. Each robot first flies horizontally at its own height, below or above the
-    others, then vertically, at `share` of the robots' speed limits at most.
+    robots cannot be controlled as a formation. Each robot first flies horizontally at its own height, below or above
+    the others, then vertically, at `share` of the robots' speed limits at most.
     """
 
     def __init__(self, p_W: Array, gains: FormationGains, limits: RobotLimits, share: float) -> None:
@@ -222,7 +222,7 @@ class AssignedPositions:
         self._speed_max_m_s, self._climb_max_m_s = share * limits.speed_max_m_s, share * limits.climb_max_m_s
 
     def velocities(self, p_W: Array) -> Array:
-        """Return the velocities (n, 3) [m/s, W] of robots at p_W (n, 3) [m], not yet guarded."""
+        """Return the velocities (n, 3) [m/s, W] of robots at p_W (n, 3) [m], before `guard` limits them."""
         v_W = self._gain_1_s * (self.p_W - p_W)
         horizontal_m = np.linalg.norm((self.p_W - p_W)[:, :2], axis=1)
         speed_m_s = self._gain_1_s * horizontal_m
@@ -231,6 +231,6 @@ class AssignedPositions:
         return v_W
 
     def farthest(self, p_W: Array) -> tuple[int, float]:
-        """Return the index of the robot farthest from its position, and the distance [m]."""
+        """Return the index of the robot farthest from its assigned position, and the distance [m]."""
         distances_m = np.linalg.norm(self.p_W - p_W, axis=1)
         return int(np.argmax(distances_m)), float(distances_m.max())

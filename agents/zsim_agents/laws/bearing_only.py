@@ -5,7 +5,8 @@
 Zhao, Zelazo, Bearing rigidity and almost global bearing-only formation stabilization, IEEE Trans. Automatic Control 61
 (2016), arXiv:1408.6552. The centroid and the scale s = sqrt(mean |p_i - centroid|^2) are constant, so that the
 formation attains its shape and attitude at its initial size; V = 1/2 |p - p*|^2 decreases. The shape must be
-infinitesimally bearing rigid: the rank of the bearing rigidity matrix is d n - d - 1. All drones need a common compass.
+infinitesimally bearing rigid: the rank of the bearing rigidity matrix is d n - d - 1. All drones need the same heading
+reference.
 The point-reflected shape is an unstable equilibrium.
 """
 

@@ -97,7 +97,7 @@ class Sight(NamedTuple):
 
 
 class PilotParameters(Parameters):
-    """Common parameters of all laws; times are simulated times, and speeds and distances are horizontal."""
+    """Common parameters of all laws; times are simulated; speeds and distances between drones are horizontal."""
 
     height_m: Annotated[float, Meta(gt=0, le=1000)] = 2.0
     takeoff_s: NonNegative = 2.0
@@ -109,7 +109,7 @@ class PilotParameters(Parameters):
     silence_s: Annotated[float, Meta(gt=0, le=60)] = 1.0
     """A drone that has been silent for longer is ignored; until then, its last message is used."""
     centre_m: tuple[Value, Value] = (0.0, 0.0)
-    """Centre of the formation in W: numbers, or expressions of t, in seconds since `start_s`."""
+    """Centre of the formation in W: numbers, or expressions in t, the time in seconds since `start_s`."""
     start_s: NonNegative = 0.0
     avoid_m: NonNegative = 1.5
     """Drones, obstacles and surfaces closer than this repel the drone; 0: no repulsion."""
@@ -157,11 +157,11 @@ class Pilot(Agent):
 
     @abstractmethod
     def velocity(self, now: Sight) -> Array:
-        """Return the velocity (2,) of the law [m/s; W], before speed limit and repulsion."""
+        """Return the velocity (2,) of the law [m/s; W], before the repulsion is added and the speed limited."""
 
     @classmethod
     def flaws(cls, parameters: Mapping[str, Any], scenario: Scenario) -> Iterator[Fault]:
-        """Yield path and text of the parameters that are invalid in a scenario."""
+        """Yield the path of each parameter that is invalid in a scenario, and the text of its fault."""
         try:
             cls.reference_of(cls.Parameters(**parameters))
         except ExpressionError as error:
@@ -213,7 +213,7 @@ class Pilot(Agent):
         try:
             reference = self._reference.at(t_ns / 1e9)
         except ExpressionError as error:  # a pole after the start
-            raise UserCodeError(f"{type(self).__name__}: parameters.{error}, since start_s; must be finite") from None
+            raise UserCodeError(f"{type(self).__name__}: parameters.{error} (t since start_s)") from None
         now = Sight(t_ns / 1e9, self._p_W[:2], self._v_W[:2], heard, reference)
         v_W = self.velocity(now) + self.avoidance(now.p_W, heard)
         return limited(v_W, self.parameters.speed_max_m_s)
@@ -230,11 +230,11 @@ class Pilot(Agent):
         return v_W
 
     def obstacles_near(self, p_W: Array, reach_m: float) -> list[tuple[float, Array]]:
-        """Return distance [m] and direction away (2,) of the obstacles and surfaces within reach beside the drone.
+        """Return distance [m] and direction away from each obstacle and surface within reach beside the drone, (2,).
 
-        The distance of a surface is that after which level flight meets its tangent plane at the nearest point. For a
-        wall, this is the distance to the wall; for a slope, it is greater the flatter the slope is. Level ground below
-        is ignored.
+        The distance of a surface is how far level flight goes until it meets the tangent plane at the nearest point.
+        For a wall, this is the distance to the wall; for a slope, it is greater the flatter the slope is. Level ground
+        below is ignored.
         """
         found = []
         for row in self._obstacles:

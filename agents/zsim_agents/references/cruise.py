@@ -12,7 +12,7 @@ Machines and Robots, Springer 2008, chapter 3.
 Let D be the displacement from start to goal; then D - v t1/2 = q (t1/2 + t2 + t3/2). So t1 determines both the
 direction of q and its length: the cruise speed, or less where t2 would be negative, with
 |q|^2 / 2a + |q| t1/2 = |D - v t1/2|. t1 solves |q(t1) - v| = a t1. Since q(t1) is continuous and bounded, a solution
-exists, no later than the time of the largest change of velocity. Any velocity between two that satisfy the limits
+exists, no later than the duration of the largest change of velocity. Any velocity between two that satisfy the limits
 satisfies them too. A path planned anew from any state on a path to the same goal is the remainder of that path.
 
 Horizontal and vertical limits differ: |.| above stands for the larger of the horizontal and the vertical component,

@@ -1,7 +1,7 @@
 """Paths of one drone: position and rate over time, peak speeds and acceleration, and scaling to limits. No I/O.
 
-A path is a piecewise polynomial, such as a minimum-snap path, or a circle, helix or figure-8 flown in laps that begin
-and end at rest on the curve.
+A path is a piecewise polynomial, such as a minimum-snap path, or a circle, helix or figure-8 flown for a number of
+laps, which begins and ends at rest on the curve.
 
 A path is a `Reference` of four variables, x, y, z [m; W] and yaw [rad, not wrapped]. Its time starts at 0; outside
 [0, duration_s] it rests at its nearer end.

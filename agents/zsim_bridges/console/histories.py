@@ -28,10 +28,10 @@ INTERVAL_S = 0.25  # simulated; minimum time between two points of a curve; form
 HISTORY_POINTS_MAX = int(SPAN_S / INTERVAL_S)
 SERIES = ("desired", "estimated", "true")
 
-TRAIL_POINTS_MAX = 6_000  # maximum number of points of all trails together: 144 kB sent to a browser each time
+TRAIL_POINTS_MAX = 6_000  # maximum number of points of all trails together: 144 kB sent to a browser with each picture
 TRAILS_S = (10.0, 30.0, 60.0, SPAN_S)  # selectable lengths of trails, simulated
 TRAIL_S = 60.0  # initial length of trails, simulated
-SPACING_M = 0.08  # minimum distance between two points of a trail: a sixth of a hull
+SPACING_M = 0.08  # minimum distance between two points of a trail: a sixth of the width of a hull
 SPACING_S = 0.05  # simulated; minimum time between two points of a trail: the period of pictures at 1 × real time
 RECORD_GAP_S = 5.0  # simulated; a larger gap in a record has not been read yet, so nothing is drawn across it
 SEGMENT_MIN_M = 1e-3  # minimum length of a segment that is drawn: a stationary drone leaves no trail
@@ -55,7 +55,7 @@ FLIGHT_UNITS = {
     "roll": "deg",
     "pitch": "deg",
 }  # variables of each drone, with units
-ESTIMATED_COUNT = 4  # only this many of them, the first ones, are estimated: views of estimates have no roll and pitch
+ESTIMATED_COUNT = 4  # number of these that are estimated, the first ones: views of estimates have no roll or pitch
 DESIRED, TRUE = SERIES.index("desired"), SERIES.index("true")
 
 
@@ -129,7 +129,7 @@ class CanvasTrails:
         self.number += 1
 
     def segments(self, t_s: float, p_W: Array) -> tuple[Array, NDArray[np.int64], Array]:
-        """Return the trails as M segments that end at positions (N, 3) at `t_s`; many points are thinned out evenly.
+        """Return the trails, which end at positions (N, 3) at `t_s`, as M segments; excess points are thinned evenly.
 
         Returns:
             the segments' ends (M, 2, 3), indices of their drones (M,), and times at which they begin (M,).
@@ -211,7 +211,7 @@ class VariableHistory:
         subtracted: int | None = None,
         at_s: float | None = None,
     ) -> tuple[Array, ...]:
-        """Return times (M,) and three curves (M,) of a variable, ordered as `SERIES`; angles in degrees, wrapped.
+        """Return times (M,) and three curves (M,) of a variable, in the order of `SERIES`; angles in degrees, wrapped.
 
         A curve is interrupted (NaN) where an angle wraps.
 
