@@ -176,7 +176,7 @@ def test_options_of_an_environment_are_refused_by_name_without_a_bundle(options:
 def test_only_the_given_options_are_refused_for_the_figures_of_papers(options: tuple[str, ...]):
     laws, scenarios = (f"of {option}" if option in options else None for option in ("--laws", "--scenarios"))
     with pytest.raises(typer.BadParameter) as raised:
-        run_commands.board(laws, scenarios, formats=["pdf"] if "--format" in options else None, papers=True)
+        run_commands.board(laws, scenarios, formats="pdf" if "--format" in options else None, papers=True)
     assert raised.value.message.endswith(f"leave out {' and '.join(options)}")
 
 

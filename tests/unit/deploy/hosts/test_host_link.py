@@ -51,15 +51,17 @@ def link() -> HostLink:
 @pytest.mark.parametrize("turns", range(6))  # of the loop, between the answer and the cancellation
 def test_a_cancellation_counts_even_while_a_command_ends(connections: list[Any], turns: int) -> None:
     async def cancel_near_the_end() -> bool:
-        host, ended = link(), asyncio.Event()
+        host, started, ended = link(), asyncio.Event(), asyncio.Event()
 
         async def command(*_: Any, **__: Any) -> SimpleNamespace:
+            started.set()
             await ended.wait()
             return SimpleNamespace(exit_status=0, stdout=b"")
 
-        (await host.open()).run = command
+        connection: Any = await host.open()
+        connection.run = command
         running = asyncio.create_task(host.run("true"))
-        await asyncio.sleep(0.01)
+        await started.wait()
         ended.set()
         for _ in range(turns):
             await asyncio.sleep(0)
