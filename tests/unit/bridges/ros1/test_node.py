@@ -249,7 +249,7 @@ async def test_a_subscriber_receives_type_and_definition(graph) -> None:
 async def test_a_cancellation_counts_even_while_a_header_arrives(turns) -> None:
     reader = asyncio.StreamReader()
     reading = asyncio.create_task(wire.read_header(reader))
-    await asyncio.sleep(0.01)
+    await asyncio.sleep(0)  # starts reading
     reader.feed_data(wire.encode_header({"topic": "/t"}))
     for _ in range(turns):
         await asyncio.sleep(0)
