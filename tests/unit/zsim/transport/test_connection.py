@@ -54,9 +54,9 @@ LET_IN = Permissions("world", "operator.eve", {"read": ("zsim/**",)})
 @pytest.mark.parametrize(
     ("endpoint", "identity", "permissions", "told", "not_told"),
     [
-        ("tls/127.0.0.1:7447", EVE, None, ("another", "refused", "--federation"), "start one"),
-        ("tls/127.0.0.1:7447", EVE, LET_IN, ("another", "--federation"), "refused"),
-        ("tcp/127.0.0.1:7447", None, None, ("another",), "allowed"),
+        ("tls/127.0.0.1:7447", EVE, None, ("another", "refuses", "--federation"), "start one"),
+        ("tls/127.0.0.1:7447", EVE, LET_IN, ("another", "--federation"), "refuses"),
+        ("tcp/127.0.0.1:7447", None, None, ("another",), "admit"),
     ],
     ids=["not let in", "let in", "without certificates"],
 )
