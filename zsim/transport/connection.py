@@ -216,7 +216,7 @@ def _no_link(endpoint: str) -> str:
 
 
 def read_permissions(link: Session) -> Permissions | None:
-    """Return our permissions under access control at the other end; None without an answer.
+    """Return this process's permissions under access control at the other end; None without an answer.
 
     Raises:
         SessionError: this process is not admitted.

@@ -256,7 +256,7 @@ class Session:
     # Publishing
 
     def put(self, key: str, message: Struct) -> None:
-        """Publish a message on its key; SessionError if our certificate does not permit us to publish there."""
+        """Publish a message on its key; SessionError if this process's certificate does not permit that."""
         self.put_raw(key, messages.encode(message))
 
     def put_raw(self, key: str, payload: bytes) -> None:
@@ -309,7 +309,7 @@ class Session:
         """Return a function that publishes (payload, attachment) on one key; a full link drops the message.
 
         Raises:
-            SessionError: `key` is not a valid key, or our certificate does not permit us to publish there.
+            SessionError: `key` is not a valid key, or this process's certificate does not permit publishing there.
         """
         self._check("publish", key)
         with _key_errors(key):
@@ -351,7 +351,7 @@ class Session:
         """Return a subscription to all messages on an expression, in order.
 
         Raises:
-            SessionError: it is not a key expression, or our certificate does not permit reading it.
+            SessionError: it is not a key expression, or this process's certificate does not permit reading it.
         """
         self._check("read", expression)
         with _key_errors(expression):
@@ -371,7 +371,7 @@ class Session:
         """Call back, on a Zenoh thread, for every message on an expression until the returned function is called.
 
         Raises:
-            SessionError: it is not a key expression, or our certificate does not permit reading it.
+            SessionError: it is not a key expression, or this process's certificate does not permit reading it.
         """
         self._check("read", expression)
         with _key_errors(expression):

@@ -26,9 +26,8 @@ from zsim.schema.quantities import Fraction, NonNegative, Positive, Real
 ROTORS_MIN, ROTORS_MAX = 4, 8  # fewer cannot hold a heading in a hover; more do not fit into a message
 ARM_MISS_MAX = 0.01  # maximum mismatch relative to the arm; design choice: rounding in a drawing
 BALANCE_MAX = 1e-6  # maximum mean moment of the rotors at equal speeds, in the units of `allocation`
-LIFT_MIN = (
-    0.2  # minimum ratio of a rotor's hover thrust to the mean; design choice: with less, it hardly adds to control
-)
+# Minimum ratio of a rotor's hover thrust to the mean; design choice: with less, it contributes too little to control
+LIFT_MIN = 0.2
 RANK_MIN = 1e-3  # minimum ratio of the weakest combination of thrust, roll, pitch and yaw to the strongest
 
 DEFAULT_MODEL, MODELS = "ardrone2", ("ardrone2", "crazyflie2")  # each is a module of this package

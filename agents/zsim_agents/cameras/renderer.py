@@ -2,9 +2,9 @@
 
 Rendering is deterministic: equal inputs give bit-identical pictures.
 
-The backdrop of ground and sky is a grey picture, which a map converts to colours: warping one channel takes a third of
-the time of warping three. Greys up to 150 are ground, and greys from HAZE on are sky. The ground repeats a square tile
-around W's origin, in levels of decreasing resolution: coarser ones are drawn far away to avoid aliasing.
+The backdrop of ground and sky is a grey picture, which a colour map converts to colours: warping one channel takes a
+third of the time of warping three. Greys up to 150 are ground, and greys from HAZE on are sky. The ground repeats a
+square tile around W's origin, in levels of decreasing resolution: coarser ones are drawn far away to avoid aliasing.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ class Renderer:
     def __init__(
         self, camera: Camera, scene: Scene, carrier: int, seed: int, name: str, ground: Ground | None = None
     ) -> None:
-        gain = 1.0 / math.sqrt(scene.light)  # compensates, in stops, for half of the light that is missing
+        # Compensates for half, in stops, of the loss of light relative to a clear day
+        gain = 1.0 / math.sqrt(scene.light)
         self._camera, self._scene, self._carrier = camera, scene, carrier
         self._exposure_s = camera.exposure_ms * 1e-3
         self._pose = camera_pose(camera)

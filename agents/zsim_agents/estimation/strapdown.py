@@ -189,7 +189,7 @@ def grow(rows: Rows, i: int, P: Array) -> Array:
 def write_growth(rows: Rows, i: int, F: Array, Q: Array) -> None:
     """Write the growth of the errors over the interval that ends now: the transition into F, the noise into Q.
 
-    Biases that are Gauss-Markov processes decay.
+    On entry, F is the identity and Q is zero. Biases that are Gauss-Markov processes decay.
     """
     row, setting = rows.nominal[i], rows.setting[i]
     dt, dt_squared = row[NOMINAL.t] - row[NOMINAL.t_start], row[NOMINAL.dt_squared]
@@ -248,9 +248,8 @@ def clone(rows: Rows, i: int, J: Array, first: int) -> None:
     if not layout[LAYOUT.clones] or not rows.counts[i, COUNT.heading_known]:
         return
     every_s = rows.setting[i, SETTING.clone_every]
-    count = math.floor(
-        row[NOMINAL.t] / every_s + 1e-6
-    )  # clones are due at multiples of every_s, as samples are of their periods
+    # Clones are due at multiples of every_s, as samples are at multiples of their own periods
+    count = math.floor(row[NOMINAL.t] / every_s + 1e-6)
     slot = count % layout[LAYOUT.clones]
     former = rows.clones[i, slot]
     if former[CLONE.t] / every_s + 1e-6 >= count:  # also false for an unused clone, whose time is NaN

@@ -292,7 +292,7 @@ class FormationReference:
     """The motion of a formation from `start_s` on; before that, it rests at its start.
 
     Args:
-        centre_m: x and y in W: numbers, or expressions of t, in seconds since start_s.
+        centre_m: x and y in W: numbers, or expressions in t, the time in seconds since start_s.
         heading_deg, scale: likewise, numbers or expressions.
 
     Raises:
