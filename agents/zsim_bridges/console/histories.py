@@ -296,7 +296,10 @@ class VariablePlots:
         for name in cluster.drones:
             self._choices |= _triples(f"{name}: ", flights.variables(name))
         self._choice = gui.add_dropdown("variables", [NONE, *self._choices], initial_value=next(iter(self._choices)))
-        windows = {f"{span_s:g} s around" if is_replay else f"the last {span_s:g} s": span_s for span_s in WINDOWS_S}
+        windows = {
+            f"{span_s:g} s around the shown time" if is_replay else f"the last {span_s:g} s": span_s
+            for span_s in WINDOWS_S
+        }
         self._window = gui.add_dropdown("window", list(windows))
         self._windows = windows
         self._errors = gui.add_checkbox("Errors", False, hint="Relative to desired values; for a drone, to true ones")
