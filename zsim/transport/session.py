@@ -430,7 +430,7 @@ class Session:
         try:
             payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
         except (OverflowError, UnicodeEncodeError) as error:
-            allowed = "arguments must be 64-bit integers, UTF-8 text, or other plain values"
+            allowed = "integers must be 64-bit, and text must be valid UTF-8"
             raise SessionError(f"{key}: {op} cannot be sent ({error}); {allowed}") from error
         if fault := self._refusal("ask", key):
             return Unanswered(ok=False, error=fault)

@@ -28,7 +28,7 @@ INTERVAL_S = 0.25  # simulated; minimum time between two points of a curve; form
 HISTORY_POINTS_MAX = int(SPAN_S / INTERVAL_S)
 SERIES = ("desired", "estimated", "true")
 
-TRAIL_POINTS_MAX = 6_000  # maximum number of points of all trails together: 144 kB sent to a browser with each picture
+TRAIL_POINTS_MAX = 6_000  # maximum number of points of all trails together: 144 kB sent to a browser at each update
 TRAILS_S = (10.0, 30.0, 60.0, SPAN_S)  # selectable lengths of trails, simulated
 TRAIL_S = 60.0  # initial length of trails, simulated
 SPACING_M = 0.08  # minimum distance between two points of a trail: a sixth of the width of a hull
